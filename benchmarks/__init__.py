@@ -1,0 +1,1 @@
+"""Where every performance figure of the docs comes from; each module runs as `python -m benchmarks.NAME`."""

@@ -1,0 +1,1 @@
+"""Prefect flows and the `ahoy` command line: the wiring, and no science."""

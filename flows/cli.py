@@ -1,0 +1,103 @@
+"""The `ahoy` command."""
+
+from __future__ import annotations
+
+import logging
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from pydantic import ValidationError
+from rich.console import Console
+
+from flows import models_cli
+
+if TYPE_CHECKING:
+    from flows.request import VideoRequest
+
+app = typer.Typer(no_args_is_help=True, add_completion=False, help=__doc__, pretty_exceptions_enable=False)
+app.add_typer(models_cli.app, name="models")
+
+EXIT_BAD_INPUT = 2
+EXIT_INTERRUPTED = 130
+
+
+@app.callback()
+def main(verbose: Annotated[bool, typer.Option("--verbose", "-v", help="log what happens")] = False) -> None:
+    """Turn videos of half-hidden people into animatable 3D Gaussian avatars."""
+    logging.basicConfig(
+        level=logging.INFO if verbose else logging.WARNING, format="%(levelname)s %(name)s: %(message)s"
+    )
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # spinning threads made a training step six times slower
+    os.environ.setdefault("PREFECT_SERVER_ANALYTICS_ENABLED", "false")
+    os.environ.setdefault("DO_NOT_TRACK", "1")
+
+
+@app.command()
+def run(
+    video: Annotated[str, typer.Argument(help="a video file")],
+    out: Annotated[Path, typer.Option(help="folder for the avatar, the videos and the report")],
+    preset: Annotated[str, typer.Option(help="draft, standard or high: how much time to spend")] = "standard",
+    subject: Annotated[int | None, typer.Option(help="which person, 0 for the most visible")] = None,
+    stages: Annotated[str | None, typer.Option(help="only these, comma-separated, and what they need")] = None,
+    store: Annotated[str | None, typer.Option(help="URL of the artifact store  [default: OUT/store]")] = None,
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", help="a knob, as STAGE.KNOB=VALUE; may be repeated")
+    ] = None,
+    prefect: Annotated[
+        bool, typer.Option("--prefect", help="run as a Prefect flow, watched at PREFECT_API_URL")
+    ] = False,
+) -> None:
+    """Turn one video into an avatar, here and now; what is already made is not made again."""
+    from flows.request import VideoRequest
+
+    console = Console()
+    try:
+        request = VideoRequest.model_validate(
+            {
+                "video": video,
+                "out": str(out),
+                "store": store,
+                "preset": preset,
+                "subject": subject,
+                "stages": tuple(stages.split(",")) if stages else None,
+                "overrides": tuple(set_ or ()),
+            }
+        )
+        paths = _run_flow(request) if prefect else _run_here(request, console)
+    except KeyboardInterrupt:
+        console.print("interrupted; finished stages are kept, the same command goes on from there")
+        raise typer.Exit(EXIT_INTERRUPTED) from None
+    except ValidationError as error:
+        for problem in error.errors():
+            console.print(
+                f"[red]error:[/] --{'.'.join(map(str, problem['loc']))}: {problem['msg']}, got {problem['input']!r}"
+            )
+        raise typer.Exit(EXIT_BAD_INPUT) from None
+    except (ValueError, OSError) as error:
+        console.print(f"[red]error:[/] {error}", markup=True, highlight=False)
+        raise typer.Exit(EXIT_BAD_INPUT) from None
+    for name, path in paths.items():
+        console.print(f"{name:<20} {path}", soft_wrap=True, highlight=False)
+
+
+def _run_here(request: VideoRequest, console: Console) -> dict[str, Path]:
+    from flows.deliver import deliver
+    from flows.pipeline import process
+    from flows.terminal import TerminalObserver
+
+    settings = request.settings()
+    source = request.source()
+    with TerminalObserver(console) as observer:
+        attempt = request.run(source, observer)
+        outcome = process(source, settings, attempt, only=request.stages)
+    for stage, reason in outcome.skipped.items():
+        console.print(f"{stage:<10} skipped: {reason}")
+    return deliver(outcome, attempt, request.out)
+
+
+def _run_flow(request: VideoRequest) -> dict[str, Path]:
+    from flows.process_video import process_video
+
+    return {name: Path(path) for name, path in process_video(request).items()}

@@ -1,0 +1,112 @@
+"""What each stage leaves in the store: the files, and the arrays inside them.
+
+A stage's artifact is a folder of files. `ARTIFACTS[stage]` names them; `check` (called at commit) opens every `.npz` and compares its
+arrays with the declaration, so that a stage cannot publish something its readers do not expect. Letters in a shape are sizes that
+must agree within one artifact (T frames, H x W pixels, J joints, ...).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True)
+class Array:
+    """One array of an `.npz` file: dtype name and shape, sizes given as integers or letters."""
+
+    dtype: str
+    shape: tuple[str | int, ...]
+
+
+@dataclass(frozen=True)
+class Blob:
+    """One file of an artifact; `arrays` is empty for files that are not `.npz`."""
+
+    name: str
+    arrays: Mapping[str, Array] = field(default_factory=dict)
+    optional: bool = False
+
+
+ARTIFACTS: Mapping[str, tuple[Blob, ...]] = {
+    "ingest": (
+        Blob(
+            "frames.npz",
+            {
+                "frames": Array("uint8", ("T", "H", "W", 3)),  # sRGB, display orientation
+                "index": Array("int64", ("T",)),  # frame number in the source
+                "pts": Array("float64", ("T",)),  # seconds from the start of the source
+                "shot": Array("int32", ("T",)),  # shot number, from 0
+            },
+        ),
+        Blob("probe.json"),
+    ),
+    "perceive": (
+        Blob(
+            "body.npz",
+            {
+                "pose": Array("float32", ("T", "J", 3)),  # axis-angle, radians; joint 0 is the root in the world
+                "transl": Array("float32", ("T", 3)),  # metres, world
+                "betas": Array("float32", ("S",)),  # one shape for the video
+                "expression": Array("float32", ("T", "E")),
+                "expression_confidence": Array("float32", ("T",)),
+                "joint_confidence": Array("float32", ("T", "J")),  # [0,1]
+                "frame_confidence": Array("float32", ("T",)),  # [0,1]
+                "used": Array("bool", ("T",)),  # a person was found and fitted in this frame
+                "viewmat": Array("float32", (4, 4)),
+                "K": Array("float32", (3, 3)),
+                "landmarks": Array("float32", ("T", 33, 3)),  # x, y in pixels, visibility in [0,1]
+            },
+        ),
+        Blob(
+            "masks.npz",
+            {
+                "visible": Array("uint8", ("T", "H", "W")),  # alpha of the visible part of the subject, 0..255
+                "amodal": Array("uint8", ("T", "H", "W")),  # silhouette of the fitted body
+                "box": Array("float32", ("T", 4)),  # x0, y0, x1, y1 of the visible mask, pixels; zeros where unused
+            },
+        ),
+        Blob("overlay.png"),  # body, landmarks and mask drawn on frames
+        Blob("fit.json"),  # field of view and where it came from, final residuals, what was skipped and why
+    ),
+    "texture": (
+        Blob(
+            "atlas.npz",
+            {
+                "observed_rgb": Array("uint8", ("A", "A", 3)),  # first write wins; 0 where never seen
+                "coverage": Array("float32", ("A", "A")),  # [0,1], 0 where never seen
+                "source_frame": Array("int32", ("A", "A")),  # index into the ingested frames, -1 where never seen
+                "filled_rgb": Array("uint8", ("A", "A", 3)),  # complete
+                "chart": Array("bool", ("A", "A")),  # texel belongs to the body's surface
+            },
+        ),
+        Blob(
+            "canonical.npz",
+            {
+                "views": Array("uint8", (4, "Hc", "Wc", 4)),  # RGBA, straight alpha: front, left, back, right
+                "coverage": Array("uint8", (4, "Hc", "Wc")),  # observed share of each pixel, 0..255
+                "partial": Array("uint8", ("Hc", "Wc", 4)),  # I_*^part: the front view, observed texels only
+                "viewmats": Array("float32", (4, 4, 4)),
+                "Ks": Array("float32", (4, 3, 3)),  # orthographic
+            },
+        ),
+        Blob("atlas.png"),  # observed, coverage, filled
+        Blob("canonical.png"),  # the partial front and the four views
+        Blob("texture.json"),
+    ),
+    "coarse": (
+        Blob("avatar.safetensors"),
+        Blob("avatar.json"),
+        Blob("losses.parquet"),
+        Blob("losses.png"),
+        Blob("compare.png"),  # observed frames beside the avatar in their pose
+    ),
+    "animate": (
+        Blob("turntable.mp4"),
+        Blob("motion.mp4"),
+        Blob("avatar.ply"),
+        Blob("turntable.png"),  # contact sheet: eight views
+        Blob("animate.json"),
+    ),
+    "report": (Blob("report.html"),),
+}

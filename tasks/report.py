@@ -1,0 +1,105 @@
+"""Stage `report`: one self-contained HTML page: pictures, scores, the bill, who did what, what was left out."""
+
+from __future__ import annotations
+
+import base64
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, select_autoescape
+from pydantic import BaseModel, ConfigDict
+
+from storage_schema.store import Manifest
+from tasks.stage import Stage, StageContext, StageOutput
+
+ABSENT = (
+    (
+        "complete: inpainting of the canonical image, generated side and back views (3.1)",
+        "not built yet; the atlas is completed by symmetry and diffusion over the surface instead",
+    ),
+    ("identity: LoRA fine-tuning of a video model (3.2)", "not built yet"),
+    ("hallucinate: RF-inversion of coarse renders (3.2)", "not built yet"),
+    (
+        "avatar: pose-dependent maps, pose and camera corrections, head path (3.3)",
+        "not built yet; the avatar is the paper's coarse one",
+    ),
+)
+
+SECTIONS = {
+    "ingest": ("The video", "What was read."),
+    "perceive": (
+        "What was seen",
+        "The fitted body, the landmarks and the mask of the visible person, drawn on the input.",
+    ),
+    "texture": (
+        "Texture and coverage",
+        "Left: what the video shows (first write wins). Middle: coverage. Right: completed.",
+    ),
+    "coarse": ("Training", "Loss by step, and observed frames beside the avatar in their pose."),
+    "animate": ("From every side", "Eight views of the avatar."),
+}
+
+
+class ReportConfig(BaseModel):
+    """The report has no knobs; its place in the settings keeps every stage alike."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+def run_report(config: ReportConfig, ctx: StageContext) -> StageOutput:
+    """Write `report.html`."""
+    page = Environment(
+        loader=PackageLoader("tasks"), autoescape=select_autoescape(default=True, default_for_string=True)
+    )
+    text = page.get_template("report.html.j2").render(**_content(ctx))
+    (ctx.out / "report.html").write_text(text, encoding="utf-8")
+    return StageOutput()
+
+
+def _content(ctx: StageContext) -> dict[str, Any]:
+    summaries = {name: manifest.summary for name, manifest in ctx.manifests.items()}
+    bills = [{"stage": name, **summary["bill"]} for name, summary in summaries.items()]
+    total = sum(bill["wall_s"] for bill in bills)
+    roles = {role: {"role": role, **who} for manifest in ctx.manifests.values() for role, who in manifest.roles.items()}
+    return {
+        "version": version("ahoy-avatars"),
+        "title": summaries["ingest"]["title"],
+        "invented": summaries["coarse"]["invented"],
+        "videos": [
+            _video(ctx, "turntable.mp4", "turntable"),
+            _video(ctx, "motion.mp4", "a motion that the video does not show"),
+        ],
+        "sections": [_section(ctx, name, ctx.manifests[name]) for name in SECTIONS],
+        "bills": [{**bill, "share": 100 * bill["wall_s"] / max(total, 1e-9)} for bill in bills],
+        "total_wall": total,
+        "total_cpu": sum(bill["cpu_s"] for bill in bills),
+        "roles": list(roles.values()),
+        "absent": list(ABSENT),
+    }
+
+
+def _section(ctx: StageContext, name: str, manifest: Manifest) -> dict[str, Any]:
+    title, text = SECTIONS[name]
+    pictures = [
+        {"kind": "png", "caption": p, "data": _base64(ctx.inputs[name] / p)} for p in manifest.summary["pictures"]
+    ]
+    facts = [(k.replace("_", " "), v) for k, v in manifest.summary.get("facts", {}).items()]
+    return {
+        "title": title,
+        "text": text,
+        "pictures": pictures,
+        "notes": manifest.summary.get("notes", []),
+        "facts": facts,
+    }
+
+
+def _video(ctx: StageContext, name: str, caption: str) -> dict[str, str]:
+    return {"caption": caption, "data": _base64(ctx.inputs["animate"] / name)}
+
+
+def _base64(path: Path) -> str:
+    return base64.b64encode(path.read_bytes()).decode()
+
+
+REPORT = Stage("report", 1, ReportConfig, ("ingest", "perceive", "texture", "coarse", "animate"), run_report)

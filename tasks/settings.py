@@ -1,0 +1,60 @@
+"""The configuration of a whole run: one frozen model per stage, three presets, and overrides by name."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from ahoy_core.avatar.coarse import CoarseConfig
+from ahoy_core.ingest import IngestConfig
+from ahoy_core.perceive.perceive import PerceiveConfig
+from ahoy_core.texture.texture import TextureConfig
+from tasks.animate import AnimateConfig
+from tasks.report import ReportConfig
+
+Preset = Literal["draft", "standard", "high"]
+
+
+class Settings(BaseModel):
+    """Every knob of a run, by stage."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    ingest: IngestConfig = IngestConfig()
+    perceive: PerceiveConfig = PerceiveConfig()
+    texture: TextureConfig = TextureConfig()
+    coarse: CoarseConfig = CoarseConfig()
+    animate: AnimateConfig = AnimateConfig()
+    report: ReportConfig = ReportConfig()
+
+    def with_overrides(self, overrides: Iterable[str]) -> Settings:
+        """Return a copy with `stage.knob=value` applied, validated as if written in a file.
+
+        Raises:
+            ValueError: an override is not of that form, or names no knob, or its value does not fit.
+        """
+        values: dict[str, Any] = self.model_dump(mode="json")
+        for text in overrides:
+            name, equals, value = text.partition("=")
+            stage, dot, knob = name.strip().partition(".")
+            if not (equals and dot) or stage not in values or knob not in values[stage]:
+                known = ", ".join(f"{s}.{k}" for s, knobs in values.items() for k in knobs)
+                raise ValueError(f"expected STAGE.KNOB=VALUE, got {text!r}; the knobs are: {known}")
+            values[stage][knob] = _literal(value)
+        try:
+            return Settings.model_validate(values)
+        except ValidationError as error:
+            lines = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}, got {e['input']!r}" for e in error.errors())
+            raise ValueError(f"the settings do not fit: {lines}; `ahoy run --help` lists the knobs") from None
+
+
+def _literal(text: str) -> Any:
+    """Read `3`, `0.5`, `true`, `null` as JSON does, anything else as text."""
+    import json
+
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError:
+        return text
