@@ -16,6 +16,7 @@ from prefect.artifacts import create_markdown_artifact, create_progress_artifact
 from prefect.exceptions import MissingContextError
 from prefect.logging import get_run_logger
 
+from ahoy_core.formats.images import read_png
 from tasks.stage import StageRef
 
 UPDATE_S = 2.0  # an API call per frame would cost more than the frame
@@ -59,7 +60,9 @@ class PrefectObserver:
 
 
 def _thumbnail(path: Path) -> str:
-    picture = cv2.imread(str(path))
+    picture = read_png(path)[..., :3]
     scale = min(1.0, PICTURE_WIDTH / picture.shape[1])
     small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    return base64.b64encode(cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 80])[1].tobytes()).decode()
+    return base64.b64encode(
+        cv2.imencode(".jpg", small[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 80])[1].tobytes()
+    ).decode()

@@ -28,7 +28,6 @@ class VideoRequest(BaseModel):
     stages: tuple[str, ...] | None = Field(None, description="only these stages and what they need; by default all")
     overrides: tuple[str, ...] = Field((), description="knobs, as STAGE.KNOB=VALUE")
     batch: str = Field("local", pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", description="name the rows are filed under")
-    attempt: int = Field(1, ge=1)
 
     def settings(self) -> Settings:
         """Return the preset with the subject and the overrides applied."""
@@ -52,4 +51,4 @@ class VideoRequest(BaseModel):
         """Open the store and name this attempt."""
         store = ArtifactStore(self.store or Path(self.out) / "store")
         video_id = f"{Path(self.video).stem[:40]}-{source.content_hash[:8]}"
-        return Run(store, Tables(store), self.batch, video_id, uuid.uuid4().hex[:12], self.attempt, observer)
+        return Run(store, Tables(store), self.batch, video_id, uuid.uuid4().hex[:12], observer)

@@ -64,7 +64,7 @@ def _content(ctx: StageContext) -> dict[str, Any]:
     roles = {role: {"role": role, **who} for manifest in ctx.manifests.values() for role, who in manifest.roles.items()}
     return {
         "version": version("ahoy-avatars"),
-        "title": summaries["ingest"]["title"],
+        "title": f"Avatar from video {ctx.manifests['ingest'].inputs['source'][:8]}",
         "invented": summaries["coarse"]["invented"],
         "videos": [
             _video(ctx, "turntable.mp4", "turntable"),

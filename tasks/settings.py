@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from ahoy_core.avatar.coarse import CoarseConfig
+from ahoy_core.avatar.config import CoarseConfig
 from ahoy_core.ingest import IngestConfig
 from ahoy_core.perceive.perceive import PerceiveConfig
 from ahoy_core.texture.texture import TextureConfig

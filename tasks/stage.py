@@ -1,14 +1,13 @@
 """What a stage is, and the one way to run it: look it up, or make it and commit it.
 
-A stage is a value (`Stage`), not a class to inherit from: a name, a version, a frozen configuration, what it needs, and
-a function from input folders to an output folder. `run_stage` alone talks to the store on its behalf, so every stage gets
-keys, leases, verification, the ledger and its bill the same way, with or without an orchestrator.
+A stage is a value (`Stage`), not a class to inherit from: a name, a version, a frozen configuration, what it needs,
+and a function from input folders to an output folder. `run_stage` alone talks to the store on its behalf, so every
+stage gets keys, leases, verification, the ledger and its bill the same way, with or without an orchestrator.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import json
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -143,7 +142,6 @@ class Run:
     batch: str
     video_id: str
     run_id: str
-    attempt: int
     observer: Observer
 
 
@@ -165,7 +163,7 @@ def run_stage(stage: Stage, config: BaseModel, inputs: Mapping[str, StageRef | S
         stage.version,
         config.model_dump(mode="json"),
         hashes,
-        {r: v["weights_sha256"] for r, v in roles.items()},
+        {r: v["weights_sha256"] for r, v in roles.items() if v["weights_sha256"]},
     )
     run.observer.started(stage.name)
     started = datetime.now(UTC)
@@ -186,12 +184,12 @@ def run_stage(stage: Stage, config: BaseModel, inputs: Mapping[str, StageRef | S
 
 def skip_stage(stage: Stage, reason: str, run: Run) -> None:
     """Record that a stage was not run, and why; the report shows the reason."""
-    row = _row(run, stage, None, "", "skipped", datetime.now(UTC), Bill())
+    row = _row(run, stage, None, None, "skipped", datetime.now(UTC), Bill())
     run.tables.append("stages", [{**row, "reason": reason}], batch=run.batch)
 
 
 def _lease(run: Run, key: str) -> AbstractContextManager[Any]:
-    return run.store.lease(key, owner=f"{run.run_id}/{run.attempt}", ttl_s=LEASE_S, wait_s=WAIT_S)
+    return run.store.lease(key, owner=run.run_id, ttl_s=LEASE_S, wait_s=WAIT_S)
 
 
 def _make(
@@ -222,11 +220,14 @@ def _make(
                 summary={**output.summary, "pictures": list(output.pictures), "bill": dataclasses.asdict(bill)},
             )
     except BaseException as error:
-        row = _row(run, stage, config, key, "failed", started, meter.read())
-        row |= {"error_class": type(error).__name__, "error_message": _message(error)}
+        row = _row(run, stage, config, key, "failed", started, meter.read()) | {
+            "error_class": type(error).__name__,
+            "error_message": _message(error),
+        }
         run.tables.append("stages", [row], batch=run.batch)
         raise
-    run.tables.append("stages", [_row(run, stage, config, key, "done", started, bill)], batch=run.batch)
+    row = _row(run, stage, config, key, "done", started, bill) | {"attempt": manifest.attempt}
+    run.tables.append("stages", [row], batch=run.batch)
     _append_results(run, key, output)
     return manifest
 
@@ -254,17 +255,17 @@ def _resolve(
 def _append_results(run: Run, key: str, output: StageOutput) -> None:
     for table, rows in (("frames", output.frames), ("metrics", output.metrics)):
         if rows:
-            run.tables.append(table, [{"video_id": run.video_id, "key": key, **row} for row in rows], batch=run.batch)
+            who = {"video_id": run.video_id, "key": key} | ({"capture": run.video_id} if table == "metrics" else {})
+            run.tables.append(table, [{**who, **row} for row in rows], batch=run.batch)
 
 
 def _row(
-    run: Run, stage: Stage, config: BaseModel | None, key: str, state: str, started: datetime, bill: Bill
+    run: Run, stage: Stage, config: BaseModel | None, key: str | None, state: str, started: datetime, bill: Bill
 ) -> dict[str, Any]:
     return {
         "batch": run.batch,
         "video_id": run.video_id,
         "run_id": run.run_id,
-        "attempt": run.attempt,
         "key": key,
         "stage": stage.name,
         "stage_version": stage.version,
@@ -273,7 +274,7 @@ def _row(
         "wall_s": bill.wall_s,
         "cpu_s": bill.cpu_s,
         "peak_rss_mb": bill.peak_rss_mb,
-        "knobs": json.dumps(config.model_dump(mode="json")) if config is not None else "{}",
+        "knobs": config.model_dump(mode="json") if config is not None else None,
     }
 
 

@@ -1,0 +1,205 @@
+"""The avatar: canonical Gaussians with skinning weights, ready to be posed, saved, loaded and trained further."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from pydantic import BaseModel, ConfigDict, Field
+from torch import Tensor
+
+from ahoy_core.avatar.deform import (
+    Canonical,
+    OffsetBounds,
+    apply_offsets,
+    deform,
+    dense_weights,
+    relative_transforms,
+)
+from ahoy_core.body.model import BodyModel
+from ahoy_core.body.rotations import matrix_to_quaternion, quaternion_to_matrix
+from ahoy_core.maps.style_unet import StyleUNet, StyleUNetConfig
+from ahoy_core.maps.template import Template
+from ahoy_core.splat import Gaussians
+
+SYNTHETIC_LABEL = "Synthetic media: a computer-generated avatar of a person, made from video; parts of it are invented."
+
+
+class AvatarInfo(BaseModel):
+    """What an avatar file says about itself."""
+
+    model_config = ConfigDict(frozen=True)
+
+    body: str = Field(description="name of the body model whose poses drive the avatar")
+    body_sha256: str = Field(default="", description="hash of the body's asset, empty if unknown")
+    licence: str = Field(default="", description="licence of the avatar, from that of the footage")
+    provenance: dict[str, str] = Field(default_factory=dict, description="source id, roles that made it, versions")
+    synthetic_media: str = Field(default=SYNTHETIC_LABEL, min_length=1)
+
+
+@dataclass(frozen=True)
+class Posed:
+    """N Gaussians in the world: means [N,3], covars [N,3,3], colors [N,3], opacities [N]: what the rasterizer takes."""
+
+    means: Tensor
+    covars: Tensor
+    colors: Tensor
+    opacities: Tensor
+
+
+@dataclass(frozen=True)
+class Avatar:
+    """A person as Gaussians on a body model.
+
+    Attributes:
+        means: [N,3] canonical pose, metres.
+        quats: [N,4] wxyz.
+        scales: [N,3] metres.
+        opacities: [N] in [0,1].
+        colors: [N,3] sRGB in [0,1].
+        skin_weights: [N,K] of the joints in `skin_indices`, rows sum to 1.
+        betas: [S] the body's shape.
+        training_poses: [T,J,3] axis-angle poses it was trained on (what animation may stay near to).
+        template: Where the Gaussians started: holds uv, observed, head, skin_indices.
+        network: The StyleUNet that made the offsets; training goes on from it.
+        bounds: The largest offsets that it can make.
+        info: Body, licence, provenance, label.
+    """
+
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    colors: Tensor
+    skin_weights: Tensor
+    betas: Tensor
+    training_poses: Tensor
+    template: Template
+    network: StyleUNet
+    bounds: OffsetBounds
+    info: AvatarInfo
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    @property
+    def uv(self) -> Tensor:
+        """[N,2] texture coordinates, origin lower left."""
+        return self.template.uv
+
+    @property
+    def observed(self) -> Tensor:
+        """[N] in [0,1]: how much of the Gaussian's surface the video showed."""
+        return self.template.observed
+
+    @property
+    def head(self) -> Tensor:
+        """[N] bool: on the head."""
+        return self.template.head
+
+    @property
+    def skin_indices(self) -> Tensor:
+        """[N,K] int64: joints of the skinning weights."""
+        return self.template.skin_indices
+
+    @property
+    def observed_share(self) -> float:
+        """Share of the surface's area that the video showed; the rest was invented."""
+        return self.template.observed_share
+
+    @cached_property
+    def covars(self) -> Tensor:
+        """[N,3,3] canonical covariances, metres²."""
+        half = quaternion_to_matrix(self.quats) * self.scales[:, None, :]
+        return half @ half.transpose(1, 2)
+
+    @cached_property
+    def lbs_weights(self) -> Tensor:
+        """[N,J] dense skinning weights."""
+        return dense_weights(self.skin_indices, self.skin_weights, self.training_poses.shape[1])
+
+    def pose(self, body: BodyModel, pose: Tensor, transl: Tensor | None = None) -> Posed:
+        """Pose the avatar.
+
+        Args:
+            body: The model named in `info`.
+            pose: [J,3] axis-angle, radians, joint 0 in the world.
+            transl: [3] metres, world; zero by default.
+
+        Raises:
+            ValueError: If the body is another one, or the pose has another shape or is not finite.
+        """
+        if body.name != self.info.body:
+            raise ValueError(f"expected body {self.info.body!r}, got {body.name!r}; convert the motion, not the avatar")
+        if tuple(pose.shape) != (body.n_joints, 3) or not bool(torch.isfinite(pose).all()):
+            raise ValueError(f"expected a finite pose ({body.n_joints}, 3), got {tuple(pose.shape)}; leave frame out")
+        place = torch.zeros(3) if transl is None else transl
+        relative = relative_transforms(body, pose[None].to(self.means), self.betas, place[None].to(self.means))[0]
+        means, covars = deform(self.means, self.covars, self.lbs_weights, relative)
+        return Posed(means, covars, self.colors, self.opacities)
+
+    def to_gaussians(self, posed: Posed | None = None) -> Gaussians:
+        """Gaussians for export, canonical or posed.
+
+        A skinned covariance is taken apart into axes and lengths, so there are no gradients (docs/avatar.md).
+        """
+        if posed is None:
+            return Gaussians(self.means, self.quats, self.scales, self.opacities, self.colors)
+        with torch.no_grad():
+            covars = posed.covars.double()
+            values, axes = torch.linalg.eigh((covars + covars.transpose(1, 2)) / 2)
+            axes[:, :, 0] *= torch.sign(torch.linalg.det(axes))[:, None]
+            quats, scales = matrix_to_quaternion(axes), values.clamp(min=0).sqrt()
+        return Gaussians(
+            posed.means, quats.to(posed.means), scales.to(posed.means), posed.opacities, posed.colors.clamp(0, 1)
+        )
+
+
+def network_config(template: Template, width: int, channels: int) -> StyleUNetConfig:
+    """The StyleUNet for a template: `channels` offsets per pixel, bottleneck 8 where the maps allow it."""
+    in_channels = template.maps().shape[1]
+    bottleneck = min(8, template.map_size // 4)
+    return StyleUNetConfig(
+        map_size=template.map_size,
+        width=width,
+        bottleneck=bottleneck,
+        in_channels=in_channels,
+        out_channels=channels,
+    )
+
+
+@torch.no_grad()
+def bake(
+    template: Template,
+    network: StyleUNet,
+    bounds: OffsetBounds,
+    betas: Tensor,
+    training_poses: Tensor,
+    info: AvatarInfo,
+) -> Avatar:
+    """Run the network once and keep the Gaussians.
+
+    Args:
+        template: Painted template.
+        network: Trained (or untrained: then the avatar is the template).
+        bounds: Largest offsets.
+        betas: [S] shape.
+        training_poses: [T,J,3].
+        info: What the file shall say.
+    """
+    canonical: Canonical = apply_offsets(template, template.gather(network(template.maps())), bounds)
+    return Avatar(
+        means=canonical.means,
+        quats=matrix_to_quaternion(canonical.rotations),
+        scales=canonical.scales,
+        opacities=canonical.opacities,
+        colors=canonical.colors.clamp(0, 1),
+        skin_weights=canonical.skin_weights,
+        betas=betas.detach().clone(),
+        training_poses=training_poses.detach().clone(),
+        template=template,
+        network=network,
+        bounds=bounds,
+        info=info,
+    )

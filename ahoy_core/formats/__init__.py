@@ -1,0 +1,1 @@
+"""Files in and out: video, images, Gaussians (`.ply`) and arrays (`.npz`)."""

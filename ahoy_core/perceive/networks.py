@@ -1,0 +1,115 @@
+"""The two TFLite networks of BlazePose, as functions of arrays.
+
+Bazarevsky et al., "BlazePose: On-device Real-time Body Pose tracking" (2020); GHUM-trained 3D variant: Grishchenko et al. (2022).
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+DETECTOR_SIZE = 224
+LANDMARKER_SIZE = 256
+N_LANDMARKS = 33
+N_RAW = 39  # 33 landmarks of the body and six that only steer the crop of the next frame
+REQUIRED = ("pose_detection", "pose_landmark_full")
+
+
+@dataclass(frozen=True)
+class RawLandmarks:
+    """What the landmark network says about one crop.
+
+    Attributes:
+        points: [39,3] x, y, z in crop pixels (of 256); z relative to the hips, negative towards the camera.
+        visibility: [39] in [0,1].
+        presence: [39] in [0,1]: inside the crop.
+        world: [39,3] metres, hips at the origin, x right, y down, z away from the camera.
+        score: [0,1]: a person is in the crop.
+        mask: [256,256] in [0,1].
+        heatmap: [64,64,39] logits.
+    """
+
+    points: NDArray[np.float32]
+    visibility: NDArray[np.float32]
+    presence: NDArray[np.float32]
+    world: NDArray[np.float32]
+    score: float
+    mask: NDArray[np.float32]
+    heatmap: NDArray[np.float32]
+
+
+class _Network:
+    """One interpreter behind a lock: TFLite's buffers belong to one caller at a time."""
+
+    def __init__(self, path: Path, num_threads: int) -> None:
+        from ai_edge_litert.interpreter import Interpreter
+
+        self._interpreter = Interpreter(model_path=str(path), num_threads=num_threads)
+        self._interpreter.allocate_tensors()
+        self._input = self._interpreter.get_input_details()[0]["index"]
+        self._outputs = {d["name"]: d["index"] for d in self._interpreter.get_output_details()}
+        self._lock = threading.Lock()
+
+    def __call__(self, image: NDArray[np.float32]) -> dict[str, NDArray[np.float32]]:
+        with self._lock:
+            self._interpreter.set_tensor(self._input, np.ascontiguousarray(image[None], dtype=np.float32))
+            self._interpreter.invoke()
+            return {name: self._interpreter.get_tensor(index)[0].copy() for name, index in self._outputs.items()}
+
+
+class Networks:
+    """Detector and landmark network, loaded from files.
+
+    Args:
+        paths: file of each network in `REQUIRED`, by name.
+        num_threads: threads of each interpreter.
+
+    Raises:
+        ValueError: a network is not among `paths`, or `num_threads` is below 1.
+    """
+
+    def __init__(self, paths: Mapping[str, Path], num_threads: int = 1) -> None:
+        missing = [name for name in REQUIRED if name not in paths]
+        if missing:
+            raise ValueError(f"expected the files of {', '.join(REQUIRED)}, got none for {', '.join(missing)}")
+        if num_threads < 1:
+            raise ValueError(f"expected num_threads of at least 1, got {num_threads}")
+        self._detector: Any = _Network(paths["pose_detection"], num_threads)
+        self._landmarker: Any = _Network(paths["pose_landmark_full"], num_threads)
+
+    def detect(self, image: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Run the detector.
+
+        Args:
+            image: [224,224,3] sRGB in [0,1].
+
+        Returns:
+            Box regressions [2254,12] in input pixels relative to their anchors, and score logits [2254].
+        """
+        out = self._detector(image * 2.0 - 1.0)
+        return out["Identity"], out["Identity_1"][:, 0]
+
+    def landmarks(self, image: NDArray[np.float32]) -> RawLandmarks:
+        """Run the landmark network on one upright crop, [256,256,3] sRGB in [0,1]."""
+        out = self._landmarker(image)
+        rows = out["Identity"].reshape(N_RAW, 5)
+        return RawLandmarks(
+            points=rows[:, :3],
+            visibility=sigmoid(rows[:, 3]),
+            presence=sigmoid(rows[:, 4]),
+            world=out["Identity_4"].reshape(N_RAW, 3),
+            score=float(out["Identity_1"][0]),
+            mask=sigmoid(out["Identity_2"][..., 0]),
+            heatmap=out["Identity_3"],
+        )
+
+
+def sigmoid(x: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Logistic function, without overflow."""
+    return np.asarray(0.5 * (1.0 + np.tanh(0.5 * x)), dtype=np.float32)

@@ -1,0 +1,118 @@
+"""Pictures to check a fit by: the body, the landmarks and the mask drawn on frames."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ahoy_core.body.model import BodyModel
+from ahoy_core.perceive.masks import VISIBLE
+
+if TYPE_CHECKING:
+    from ahoy_core.perceive.perceive import Perception
+
+TILE_HEIGHT = 360
+MASK_TINT = (60, 200, 90)
+BONES = (
+    (11, 12), (11, 13), (13, 15), (12, 14), (14, 16), (11, 23), (12, 24), (23, 24), (23, 25), (25, 27), (24, 26), (26, 28),
+    (27, 29), (29, 31), (28, 30), (30, 32), (15, 19), (16, 20),
+)  # fmt: skip
+LEFT, RIGHT, UNSEEN = (255, 170, 40), (60, 170, 255), (150, 150, 150)
+
+
+def contact_sheet(
+    frames: NDArray[np.uint8], perception: Perception, body: BodyModel, columns: int = 4, rows: int = 2
+) -> NDArray[np.uint8]:
+    """Draw evenly spaced used frames: left half of each tile the mask and landmarks, right half the fitted body.
+
+    Args:
+        frames: [T,H,W,3] sRGB.
+        perception: what was perceived in them.
+        body: the body that was fitted.
+        columns: tiles across.
+        rows: tiles down, at most.
+
+    Returns:
+        [H',W',3] uint8.
+    """
+    used = np.flatnonzero(perception.used)
+    chosen = used[np.unique(np.linspace(0, len(used) - 1, columns * rows).round().astype(int))]
+    tiles = [np.concatenate(draw_frame(frames[t], perception, body, int(t)), axis=1) for t in chosen]
+    blank = np.zeros_like(tiles[0])
+    tiles += [blank] * (-len(tiles) % columns if len(tiles) > columns else 0)
+    width = min(columns, len(tiles))
+    return np.concatenate([np.concatenate(tiles[i : i + width], axis=1) for i in range(0, len(tiles), width)])
+
+
+def draw_frame(
+    frame: NDArray[np.uint8], perception: Perception, body: BodyModel, t: int
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Return two pictures of one frame, `TILE_HEIGHT` high: mask and landmarks, and the shaded body."""
+    scale = TILE_HEIGHT / frame.shape[0]
+    size = (max(1, round(frame.shape[1] * scale)), TILE_HEIGHT)
+    picture = cv2.resize(frame, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
+    mask = cv2.resize(perception.visible[t], size, interpolation=cv2.INTER_LINEAR)
+    seen = draw_mask(picture, mask)
+    draw_landmarks(seen, perception.landmarks[t] * np.array([scale, scale, 1.0]))
+    with torch.no_grad():
+        posed = body(
+            torch.from_numpy(perception.pose[t : t + 1]),
+            torch.from_numpy(perception.betas)[None],
+            torch.from_numpy(perception.transl[t : t + 1]),
+        )
+    K = perception.K.astype(np.float64) * np.array([[scale], [scale], [1.0]])
+    return seen, draw_body(picture, posed.vertices[0].numpy(), body.faces.numpy(), K)
+
+
+def draw_mask(picture: NDArray[np.uint8], mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Tint what the mask covers, darken the rest and draw its outline."""
+    alpha = mask[..., None].astype(np.float32) / 255.0
+    tinted = 0.65 * picture + 0.35 * np.array(MASK_TINT, np.float32)
+    result = np.ascontiguousarray((alpha * tinted + (1 - alpha) * 0.45 * picture).astype(np.uint8))
+    outlines, _ = cv2.findContours((mask > VISIBLE).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    cv2.drawContours(result, outlines, -1, MASK_TINT, 1, cv2.LINE_AA)
+    return result
+
+
+def draw_landmarks(picture: NDArray[np.uint8], landmarks: NDArray[np.floating]) -> None:
+    """Draw bones and points [33,3] (x, y, visibility) in place: the person's left orange, right blue, hidden ones grey."""
+    points = [(round(float(x)), round(float(y))) for x, y in landmarks[:, :2]]
+    for a, b in BONES:
+        hidden = min(landmarks[a, 2], landmarks[b, 2]) < 0.5
+        colour = UNSEEN if hidden else (LEFT if a % 2 and b % 2 else RIGHT if not (a % 2 or b % 2) else (255, 255, 255))
+        cv2.line(picture, points[a], points[b], colour, 1, cv2.LINE_AA)
+    for i, point in enumerate(points):
+        colour = UNSEEN if landmarks[i, 2] < 0.5 else (LEFT if i % 2 else RIGHT)
+        cv2.circle(picture, point, 2, colour, -1, cv2.LINE_AA)
+
+
+def draw_body(
+    picture: NDArray[np.uint8],
+    vertices: NDArray[np.floating],
+    faces: NDArray[np.integer],
+    K: NDArray[np.floating],
+    opacity: float = 0.6,
+) -> NDArray[np.uint8]:
+    """Lay the shaded body over a picture, far triangles first; vertices [V,3] world, K in this picture's pixels."""
+    corners = vertices[faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True) + 1e-12
+    centres = corners.mean(axis=1)
+    shade = -np.einsum("ni,ni->n", normals, centres / (np.linalg.norm(centres, axis=1, keepdims=True) + 1e-12))
+    drawn = np.flatnonzero((shade > 0) & (corners[..., 1].min(1) > 1e-3))
+    drawn = drawn[np.argsort(-centres[drawn, 1])]
+    depth = np.maximum(vertices[:, 1], 1e-3)
+    pixels = np.stack([vertices[:, 0] / depth * K[0, 0] + K[0, 2], -vertices[:, 2] / depth * K[1, 1] + K[1, 2]], axis=1)
+    limit = 4.0 * max(picture.shape)
+    fixed = np.round(np.clip(pixels - 0.5, -limit, limit) * 16).astype(np.int32)
+    layer = picture.copy()
+    for face in drawn:
+        light = float(shade[face])
+        cv2.fillConvexPoly(
+            layer, fixed[faces[face]], (60 + 150 * light, 100 + 140 * light, 90 + 165 * light), cv2.LINE_8, 4
+        )
+    return np.asarray(cv2.addWeighted(picture, 1 - opacity, layer, opacity, 0.0), dtype=np.uint8)

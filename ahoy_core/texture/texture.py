@@ -1,0 +1,232 @@
+"""The texture stage (paper section 3.1): frames and fitted body -> atlas and canonical views."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from ahoy_core.body.canonical import canonical_pose
+from ahoy_core.body.model import BodyModel
+from ahoy_core.body.packaged import PackagedBody
+from ahoy_core.texture.atlas import AtlasAccumulator, ObservedAtlas
+from ahoy_core.texture.canonical import canonical_views
+from ahoy_core.texture.fill import FilledAtlas, fill_atlas
+from ahoy_core.texture.inputs import TextureConfig, check_inputs, choose_frames
+from ahoy_core.texture.rays import BoolArray, FloatArray, IntArray
+from ahoy_core.texture.surface import REFERENCE_HEIGHT, Surface, height_in_pixels, look, trust
+from ahoy_core.texture.texels import TexelMap, texel_map
+
+Progress = Callable[[int, int], None]
+# Bodies posed in one call: enough to fill torch's vector units, few enough that vertices of long videos are never
+# held together.
+POSED_TOGETHER = 16
+
+
+@dataclass(frozen=True)
+class Texture:
+    """The artifact "texture" (storage_schema): fields of atlas.npz, canonical.npz and texture.json.
+
+    observed_rgb [A,A,3] uint8, coverage [A,A] float32, source_frame [A,A] int32 (-1: never seen), filled_rgb [A,A,3]
+    uint8 (complete, padded for bilinear lookups), chart [A,A] bool; views [4,H,W,4] uint8, view_coverage [4,H,W]
+    uint8, partial [H,W,4] uint8, viewmats [4,4,4] and Ks [4,3,3] float32 (orthographic); notes, ready for JSON.
+    """
+
+    observed_rgb: IntArray
+    coverage: FloatArray
+    source_frame: IntArray
+    filled_rgb: IntArray
+    chart: BoolArray
+    views: IntArray
+    view_coverage: IntArray
+    partial: IntArray
+    viewmats: FloatArray
+    Ks: FloatArray
+    notes: dict[str, Any]
+
+    def atlas_arrays(self) -> dict[str, np.ndarray]:
+        """Arrays of atlas.npz."""
+        return {
+            name: getattr(self, name) for name in ("observed_rgb", "coverage", "source_frame", "filled_rgb", "chart")
+        }
+
+    def canonical_arrays(self) -> dict[str, np.ndarray]:
+        """Arrays of canonical.npz."""
+        arrays = {name: getattr(self, name) for name in ("views", "partial", "viewmats", "Ks")}
+        return {**arrays, "coverage": self.view_coverage}
+
+
+@dataclass(frozen=True)
+class _Log:
+    """By frame number: texels written, and the shift (x, y in pixels) found before writing."""
+
+    written: dict[int, int]
+    shifts: dict[int, tuple[float, float]]
+
+
+def build_texture(
+    frames: IntArray,
+    visible: IntArray,
+    fit: Mapping[str, np.ndarray],
+    body: BodyModel,
+    config: TextureConfig,
+    progress: Progress | None = None,
+    canonical: FloatArray | None = None,
+) -> Texture:
+    """Accumulate the atlas over the frames, complete it, and view the textured body in canonical pose.
+
+    Args:
+        frames: [T,H,W,3] uint8 sRGB.
+        visible: [T,H,W] uint8 alpha of the visible part of the person.
+        fit: the arrays of the perceive stage's body.npz: pose [T,J,3], transl [T,3], betas [S], expression [T,E],
+            joint_confidence [T,J], frame_confidence [T], used [T], viewmat [4,4], K [3,3].
+        body: the body model that was fitted.
+        config: knobs.
+        progress: called with frames done and frames in all.
+        canonical: [V,3] the fitted shape in the canonical pose theta_*; `canonical_vertices` of the packaged body by
+            default.
+
+    Raises:
+        ValueError: where shapes disagree, or an array is missing.
+    """
+    check_inputs(frames, visible, fit, body)
+    surface = Surface.of(body)
+    texels = texel_map(surface, config.atlas_size)
+    chosen, rejected = choose_frames(fit["used"], fit["frame_confidence"], config)
+    observed, log = _accumulate(frames, visible, fit, body, surface, texels, chosen, config, progress)
+    vertices = canonical_vertices(body, fit["betas"]) if canonical is None else canonical
+    filled = fill_atlas(observed, surface, texels, vertices, config.symmetry)
+    rendered = canonical_views(
+        surface,
+        texels,
+        vertices,
+        observed,
+        filled.rgb,
+        config.canonical_height,
+        config.canonical_width,
+        config.supersample,
+    )
+    return Texture(
+        observed_rgb=observed.rgb,
+        coverage=observed.coverage,
+        source_frame=observed.source_frame,
+        filled_rgb=filled.rgb,
+        chart=texels.chart,
+        views=rendered.views,
+        view_coverage=rendered.coverage,
+        partial=rendered.partial,
+        viewmats=rendered.cameras.viewmats.numpy().astype(np.float32),
+        Ks=rendered.cameras.Ks.numpy().astype(np.float32),
+        notes=_notes(observed, filled, surface, texels, vertices, chosen, rejected, log, config),
+    )
+
+
+def canonical_vertices(body: BodyModel, betas: FloatArray) -> FloatArray:
+    """Vertices [V,3] of a shape in canonical pose with zero translation; float32, metres.
+
+    Args:
+        body: the packaged body.
+        betas: [S].
+
+    Raises:
+        ValueError: for a body that has no canonical pose.
+    """
+    if not isinstance(body, PackagedBody):
+        raise ValueError(f"expected the packaged body, got {body.name!r}: pass its vertices in canonical pose")
+    shape = torch.as_tensor(betas).to(body.lbs_weights)
+    with torch.no_grad():
+        output = body(canonical_pose(body)[None], shape[None], shape.new_zeros(1, 3))
+    vertices: FloatArray = output.vertices[0].cpu().numpy().astype(np.float32)
+    return vertices
+
+
+def _accumulate(
+    frames: IntArray,
+    visible: IntArray,
+    fit: Mapping[str, np.ndarray],
+    body: BodyModel,
+    surface: Surface,
+    texels: TexelMap,
+    chosen: list[int],
+    config: TextureConfig,
+    progress: Progress | None,
+) -> tuple[ObservedAtlas, _Log]:
+    """The observed atlas, and what happened on the way."""
+    atlas = AtlasAccumulator(surface, texels, config.mode, config.grazing_cos)
+    weights = body.lbs_weights.cpu().numpy()
+    log = _Log({}, {})
+    for done, (t, vertices) in enumerate(_posed(body, fit, chosen), start=1):
+        if not np.isfinite(vertices).all():
+            log.written[t] = 0
+            continue
+        seen = look(
+            surface,
+            vertices,
+            fit["viewmat"],
+            fit["K"],
+            visible[t],
+            grazing_cos=config.grazing_cos,
+            boundary_px=config.boundary_px,
+        )
+        shift = atlas.shift(frames[t], seen, config.align_px * height_in_pixels(seen.hits) / REFERENCE_HEIGHT)
+        if shift != (0.0, 0.0):
+            K = _shifted(fit["K"], shift)
+            seen = trust(surface, seen.caster, K, visible[t], config.grazing_cos, config.boundary_px)
+        confidence = fit["frame_confidence"][t] * (weights @ fit["joint_confidence"][t])
+        floor = config.min_joint_confidence * float(fit["frame_confidence"][t])
+        log.shifts[t] = shift
+        log.written[t] = atlas.add(t, frames[t], visible[t], seen, confidence, floor)
+        if progress is not None:
+            progress(done, len(chosen))
+    return atlas.result(), log
+
+
+def _shifted(K: FloatArray, shift: tuple[float, float]) -> FloatArray:
+    moved = np.array(K, dtype=np.float64)
+    moved[:2, 2] += shift
+    return moved
+
+
+def _posed(body: BodyModel, fit: Mapping[str, np.ndarray], chosen: list[int]) -> Iterator[tuple[int, FloatArray]]:
+    """Frame numbers and posed vertices [V,3], a few frames posed at a time."""
+    like = body.lbs_weights
+    betas = torch.as_tensor(fit["betas"]).to(like)
+    for start in range(0, len(chosen), POSED_TOGETHER):
+        numbers = chosen[start : start + POSED_TOGETHER]
+        pose, transl, expression = (
+            torch.as_tensor(fit[name][numbers]).to(like) for name in ("pose", "transl", "expression")
+        )
+        with torch.no_grad():
+            output = body(pose, betas.expand(len(numbers), -1), transl, expression)
+        yield from zip(numbers, output.vertices.cpu().numpy(), strict=True)
+
+
+def _notes(
+    observed: ObservedAtlas,
+    filled: FilledAtlas,
+    surface: Surface,
+    texels: TexelMap,
+    vertices: FloatArray,
+    chosen: list[int],
+    rejected: dict[str, list[int]],
+    log: _Log,
+    config: TextureConfig,
+) -> dict[str, Any]:
+    """What texture.json says."""
+    areas = texels.areas(vertices, surface)
+    seen = observed.coverage.ravel()[texels.flat] > 0
+    return {
+        "observed_share": float(areas[seen].sum() / max(areas.sum(), 1e-12)),
+        "mirrored_share": filled.mirrored,
+        "diffused_share": filled.diffused,
+        "fill": "left/right symmetry, then harmonic on the surface" if config.symmetry else "harmonic on the surface",
+        "skin": {"rgb": list(filled.skin), "from": filled.skin_from},
+        "mode": config.mode,
+        "frames_used": chosen,
+        "texels_written": {str(t): count for t, count in log.written.items()},
+        "frame_shifts_px": {str(t): list(shift) for t, shift in log.shifts.items() if shift != (0.0, 0.0)},
+        "frames_rejected": rejected,
+    }

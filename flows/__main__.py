@@ -1,0 +1,5 @@
+"""`python -m flows` is `ahoy`."""
+
+from flows.cli import app
+
+app()

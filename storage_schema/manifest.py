@@ -1,0 +1,167 @@
+"""The manifest: the one file whose presence says that a stage is done, and with what result."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, fields
+from typing import Any
+
+from storage_schema.errors import ArtifactError, CorruptError, StoreVersionError
+from storage_schema.keys import canonical, canonical_json
+
+SCHEMA_VERSION = 1
+
+# Four digits sort well in a listing; more follow without harm, the order is numeric.
+_MANIFEST_NAME = re.compile(r"manifest\.(\d{4,9})\.json")
+_PART = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,127}")
+_MAX_DEPTH = 4
+
+
+@dataclass(frozen=True)
+class BlobRef:
+    """One file of an artifact.
+
+    Attributes:
+        name: as declared by the stage, relative to its folder, with `/`.
+        path: where it lies, relative to the root of the store.
+        size: bytes.
+        sha256: of its bytes, 64 hexadecimal digits.
+    """
+
+    name: str
+    path: str
+    size: int
+    sha256: str
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """What a committed attempt at a stage left in the store.
+
+    Attributes:
+        schema_version: of this format.
+        key: the stage's key (`stage_key`).
+        stage: its name.
+        stage_version: its version.
+        attempt: which attempt wrote the blobs.
+        created_at: UTC, ISO 8601.
+        config: the validated configuration.
+        inputs: input name -> content hash of the input artifact.
+        roles: role -> who filled it (name, licence, sha256 of the weights).
+        summary: the stage's results that fit in JSON.
+        blobs: its files, sorted by name.
+        content_hash: hash over the names and hashes of the blobs; identical outputs have an identical one.
+    """
+
+    schema_version: int
+    key: str
+    stage: str
+    stage_version: int
+    attempt: str
+    created_at: str
+    config: dict[str, Any]
+    inputs: dict[str, str]
+    roles: dict[str, dict[str, Any]]
+    summary: dict[str, Any]
+    blobs: tuple[BlobRef, ...]
+    content_hash: str
+
+    def blob(self, name: str) -> BlobRef:
+        """The blob called `name`.
+
+        Raises:
+            KeyError: there is none; the message lists those there are.
+        """
+        for blob in self.blobs:
+            if blob.name == name:
+                return blob
+        raise KeyError(f"{self.stage} has no {name!r}; it has {[blob.name for blob in self.blobs]}")
+
+    def to_json(self) -> bytes:
+        """Readable JSON with a checksum of itself, so that a damaged manifest is never taken for a whole one."""
+        body = canonical(asdict(self), "manifest")
+        document = {"sha256": hashlib.sha256(canonical_json(body)).hexdigest(), "manifest": body}
+        return (json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode("utf-8")
+
+    @classmethod
+    def from_json(cls, data: bytes) -> Manifest:
+        """Read what `to_json` wrote.
+
+        Raises:
+            CorruptError: the bytes are not a whole, unchanged manifest.
+            StoreVersionError: a newer version of this software wrote it.
+        """
+        body = _checked_body(data)
+        if body["schema_version"] > SCHEMA_VERSION:
+            raise StoreVersionError(
+                f"manifest of schema version {body['schema_version']}, expected at most {SCHEMA_VERSION}: a newer "
+                "version of this software wrote this store; install that version, or use another store"
+            )
+        if set(body) != {field.name for field in fields(cls)}:
+            raise CorruptError(
+                f"manifest has fields {sorted(body)}, expected {sorted(field.name for field in fields(cls))}"
+            )
+        blobs = tuple(BlobRef(**blob) for blob in body.pop("blobs"))
+        manifest = cls(blobs=blobs, **body)
+        if manifest.content_hash != content_hash(blobs):
+            raise CorruptError("manifest's content hash does not fit its blobs")
+        return manifest
+
+
+def content_hash(blobs: Iterable[BlobRef]) -> str:
+    """Hash over the blobs' names and hashes; where they lie and in which order they are given does not matter."""
+    return hashlib.sha256(canonical_json(sorted([blob.name, blob.sha256] for blob in blobs))).hexdigest()
+
+
+def manifest_name(generation: int) -> str:
+    """File name of the manifest of a generation (from 1)."""
+    return f"manifest.{generation:04d}.json"
+
+
+def generation_of(name: str) -> int | None:
+    """Generation of a manifest's file name; None if it is not one."""
+    match = _MANIFEST_NAME.fullmatch(name)
+    return int(match.group(1)) if match else None
+
+
+def check_blob_name(name: str) -> None:
+    """Refuse names that could leave the attempt's folder or differ between file systems.
+
+    Raises:
+        ArtifactError: not one to four parts joined by `/`, each of letters, digits, `.`, `_`, `-`, not starting with
+            `.` or `-`.
+    """
+    parts = name.split("/")
+    if len(parts) > _MAX_DEPTH or not all(_PART.fullmatch(part) and not part.endswith(".") for part in parts):
+        raise ArtifactError(
+            f"file name {name!r}: expected at most {_MAX_DEPTH} parts joined by '/', each of letters, digits, '.', '_' "
+            "and '-', not starting with '.' or '-' and not ending with '.'; rename it"
+        )
+
+
+def check_name(name: str, what: str) -> None:
+    """Refuse a key, batch or owner that could not be one folder name everywhere.
+
+    Raises:
+        ArtifactError: not letters, digits, `.`, `_`, `-`, or starting with `.` or `-`, or ending with `.`.
+    """
+    if not isinstance(name, str) or not _PART.fullmatch(name) or name.endswith("."):
+        raise ArtifactError(
+            f"{what}: expected 1 to 128 letters, digits, '.', '_' or '-', not starting with '.' or '-' "
+            f"and not ending with '.', got {name!r}"
+        )
+
+
+def _checked_body(data: bytes) -> dict[str, Any]:
+    try:
+        document = json.loads(data)
+        body, expected = document["manifest"], document["sha256"]
+        whole = hashlib.sha256(canonical_json(body)).hexdigest() == expected
+    except (ValueError, TypeError, KeyError) as error:
+        raise CorruptError(f"manifest is unreadable ({error})") from error
+    if not whole or not isinstance(body, dict) or not isinstance(body.get("schema_version"), int):
+        raise CorruptError("manifest does not have the checksum it was written with")
+    return body

