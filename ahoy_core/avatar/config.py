@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 from pydantic import BaseModel, ConfigDict, Field
 
 from ahoy_core.avatar.deform import OffsetBounds
@@ -13,15 +11,15 @@ from ahoy_core.avatar.losses import LossWeights
 class CoarseConfig(BaseModel):
     """What trades accuracy for time in `train_coarse`, and the terms of its objective."""
 
-    model_config = ConfigDict(frozen=True)
+    model_config = ConfigDict(frozen=True, extra="forbid")
 
     map_size: int = Field(default=256, ge=16, description="side of the canonical maps, a power of two: sets N")
     width: int = Field(default=16, ge=4, description="channels of the StyleUNet at its finest resolution")
-    steps: int = Field(default=150, ge=1, description="optimiser steps")
+    steps: int = Field(default=80, ge=1, description="optimiser steps")
     views_per_step: int = Field(default=2, ge=1, description="canonical views per network pass")
     frames_per_step: int = Field(default=2, ge=1, description="observed frames per network pass")
     max_frames: int = Field(default=48, ge=1, description="observed frames kept, evenly spread")
-    learning_rate: float = Field(default=4e-3, gt=0)
+    learning_rate: float = Field(default=8e-3, gt=0)
     check_every: int = Field(default=25, ge=1, description="steps between two looks at the held-out frame")
     patience: int = Field(
         default=2, ge=1, description="checks in a row that may be worse than the best before it stops"
@@ -30,10 +28,3 @@ class CoarseConfig(BaseModel):
     seed: int = Field(default=0, ge=0)
     weights: LossWeights = LossWeights()
     bounds: OffsetBounds = OffsetBounds()
-
-
-PRESETS: Mapping[str, CoarseConfig] = {
-    "draft": CoarseConfig(map_size=128, steps=80),
-    "standard": CoarseConfig(),
-    "high": CoarseConfig(map_size=512, width=16, steps=400),
-}

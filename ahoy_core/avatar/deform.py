@@ -30,7 +30,7 @@ def offset_channels(template: Template) -> int:
 class OffsetBounds(BaseModel):
     """Largest offsets from the template; every one is `bound * tanh(raw)`, so that no network output can leave them."""
 
-    model_config = ConfigDict(frozen=True)
+    model_config = ConfigDict(frozen=True, extra="forbid")
 
     position: float = Field(default=0.05, gt=0, description="metres, per axis")
     rotation: float = Field(default=0.8, gt=0, description="radians, per axis")

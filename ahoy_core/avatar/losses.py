@@ -13,7 +13,7 @@ from ahoy_core.maps.template import Template
 class LossWeights(BaseModel):
     """Weights of the terms; zero leaves a term out. L1 has weight 1 in both sums of equation 1."""
 
-    model_config = ConfigDict(frozen=True)
+    model_config = ConfigDict(frozen=True, extra="forbid")
 
     canonical: float = Field(default=1.0, ge=0, description="the V canonical views")
     observed: float = Field(default=1.0, ge=0, description="the observed frames")

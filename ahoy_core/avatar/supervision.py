@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -57,47 +56,6 @@ class CoarseInputs:
     view_cameras: Cameras
     atlas: Tensor
     atlas_coverage: Tensor
-
-    @classmethod
-    def from_arrays(
-        cls,
-        body: BodyModel,
-        frames: np.ndarray,
-        visible: np.ndarray,
-        fit: Mapping[str, np.ndarray],
-        atlas: Mapping[str, np.ndarray],
-        canonical: Mapping[str, np.ndarray],
-    ) -> CoarseInputs:
-        """The inputs from the arrays of the earlier stages' files.
-
-        Args:
-            body: The fitted body model.
-            frames: [T,H,W,3] uint8 of frames.npz.
-            visible: [T,H,W] uint8 of masks.npz.
-            fit: Arrays of body.npz.
-            atlas: Arrays of atlas.npz.
-            canonical: Arrays of canonical.npz.
-        """
-        views = torch.from_numpy(np.ascontiguousarray(canonical["views"])).permute(0, 3, 1, 2)
-        viewmats, Ks = (torch.from_numpy(np.asarray(canonical[name], np.float32)) for name in ("viewmats", "Ks"))
-        confidence = torch.from_numpy(np.asarray(fit["frame_confidence"], np.float32))
-        return cls(
-            body=body,
-            betas=torch.from_numpy(np.asarray(fit["betas"], np.float32)),
-            pose=torch.from_numpy(np.asarray(fit["pose"], np.float32)),
-            transl=torch.from_numpy(np.asarray(fit["transl"], np.float32)),
-            frames=torch.from_numpy(np.ascontiguousarray(frames)).permute(0, 3, 1, 2),
-            masks=torch.from_numpy(np.ascontiguousarray(visible)),
-            viewmat=torch.from_numpy(np.asarray(fit["viewmat"], np.float32)),
-            K=torch.from_numpy(np.asarray(fit["K"], np.float32)),
-            used=torch.from_numpy(np.asarray(fit["used"], bool)),
-            confidence=confidence,
-            views=unit_range(views),
-            view_coverage=unit_range(torch.from_numpy(np.ascontiguousarray(canonical["coverage"]))),
-            view_cameras=Cameras(viewmats, Ks, views.shape[3], views.shape[2], "ortho"),
-            atlas=unit_range(torch.from_numpy(np.ascontiguousarray(atlas["filled_rgb"])).permute(2, 0, 1)),
-            atlas_coverage=torch.from_numpy(np.asarray(atlas["coverage"], np.float32)),
-        )
 
     def __post_init__(self) -> None:
         count = len(self.frames)

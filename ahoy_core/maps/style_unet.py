@@ -25,7 +25,7 @@ _LEAK, _GAIN = 0.2, math.sqrt(2.0)
 class StyleUNetConfig(BaseModel):
     """Size of a StyleUNet: the two knobs that trade accuracy for time are `map_size` and `width`."""
 
-    model_config = ConfigDict(frozen=True)
+    model_config = ConfigDict(frozen=True, extra="forbid")
 
     map_size: int = Field(default=256, ge=16, description="side of the input and output maps, pixels; a power of two")
     width: int = Field(default=16, ge=4, description="channels at the finest resolution; doubled at each coarser one")

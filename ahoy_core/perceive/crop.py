@@ -47,7 +47,7 @@ class Roi:
 
 
 def roi_from_points(centre: NDArray[np.floating], top: NDArray[np.floating]) -> Roi:
-    """Build the crop from the two alignment points: the hips' centre, and a point on the circle round the body, above the head.
+    """Build the crop from two points: the hips' centre, and a point above the head on the circle round the body.
 
     Args:
         centre: [2] image pixels.
@@ -85,9 +85,7 @@ def paste(mask: NDArray[np.floating], roi: Roi, height: int, width: int) -> NDAr
     """Lay a square mask [N,N] back into the image; 0 outside of the square. Returns [height,width]."""
     matrix = cv2.invertAffineTransform(_index_matrix(roi, mask.shape[0]))
     return np.asarray(
-        cv2.warpAffine(
-            mask.astype(np.float32), matrix, (width, height), flags=cv2.WARP_INVERSE_MAP | cv2.INTER_LINEAR
-        ),
+        cv2.warpAffine(mask.astype(np.float32), matrix, (width, height), flags=cv2.WARP_INVERSE_MAP | cv2.INTER_LINEAR),
         dtype=np.float32,
     )
 

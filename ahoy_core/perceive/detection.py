@@ -22,7 +22,7 @@ SCORE_CLIP = 100.0  # logits beyond this say the same
 
 @dataclass(frozen=True)
 class Detection:
-    """One person: face-and-shoulder box [4] (x0, y0, x1, y1), alignment points [4,2], both in image pixels, and score."""
+    """One person: head box [4] (x0, y0, x1, y1) and alignment points [4,2], both in image pixels, and score."""
 
     box: NDArray[np.float64]
     keypoints: NDArray[np.float64]

@@ -1,7 +1,7 @@
 """The guided filter (He, Sun, Tang, 2010) with a colour guide: a mask's edges move to the picture's, and stay soft.
 
-Written out because OpenCV 5.0.0's `ximgproc.guidedFilter` does not compute it: with a colour guide its result differs from the definition by
-up to 0.5 of the mask's range, and smaller `eps` blurs more.
+Written out because OpenCV 5.0.0's `ximgproc.guidedFilter` does not compute it: with a colour guide its result differs
+from the definition by up to 0.5 of the mask's range, and smaller `eps` blurs more.
 """
 
 from __future__ import annotations

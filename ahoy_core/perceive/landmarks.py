@@ -64,7 +64,7 @@ class LandmarkTrack:
 
 @dataclass(frozen=True)
 class _Reading:
-    """The network's answer for one crop, in image coordinates: points [39,3], world [39,3], visibility [39], mask, score."""
+    """The network's answer for one crop, in the image: points [39,3], world [39,3], visibility [39], mask, score."""
 
     points: NDArray[np.float64]
     world: NDArray[np.float64]
@@ -93,7 +93,8 @@ def run_landmarks(
         frames: [T,H,W,3] sRGB.
         shot: [T] shot number of each frame; one shot unless given.
         subject: number of the person, 0 the most prominent; None: the most prominent of each shot.
-        passes: 1 forward; 2 also mirrored; 3 forward, mirrored and backward in time; 4 also backward mirrored. Their mean is returned.
+        passes: 1 forward; 2 also mirrored; 3 forward, mirrored and backward in time; 4 also backward mirrored. Their
+            mean is returned.
         progress: called with steps done and in total.
 
     Raises:

@@ -9,8 +9,10 @@ from ahoy_core.body.rotations import nearest_rotation
 from ahoy_core.perceive.residuals import MIN_DEPTH, Observations
 
 TORSO = (11, 12, 23, 24)  # shoulders and hips
-UNSEEN_WEIGHT = 0.05  # a start is needed even where the torso is hidden
-DEPTH_SPREAD = 0.1  # metres that a person's depth differs from the clip's median, in the linear solve: limbs are off at the start
+ENOUGH_WEIGHT = 0.5  # of the four; below it the torso is hidden, and a start is needed all the same
+DEPTH_SPREAD = (
+    0.1  # metres that a person's depth differs from the clip's median, in the linear solve: limbs are off at the start
+)
 
 
 def root_rotations(rest_landmarks: Tensor, seen: Observations) -> Tensor:
@@ -24,7 +26,8 @@ def root_rotations(rest_landmarks: Tensor, seen: Observations) -> Tensor:
         [N,3,3] root rotations in the world.
     """
     torso = list(TORSO)
-    weights = seen.weights[:, torso, None] + UNSEEN_WEIGHT
+    weights = seen.weights[:, torso, None]
+    weights = torch.where(weights.sum(1, keepdim=True) < ENOUGH_WEIGHT, torch.ones_like(weights), weights)
     weights = weights / weights.sum(1, keepdim=True)
     theirs = seen.world[:, torso]
     ours = rest_landmarks[torso].expand_as(theirs)
@@ -51,7 +54,7 @@ def translations(landmarks: Tensor, seen: Observations) -> Tensor:
     # (x + tx) = u (y + ty) and -(z + tz) = v (y + ty)
     rows = torch.cat([torch.stack([one, -u, zero], -1), torch.stack([zero, -v, -one], -1)], dim=1)
     right = torch.cat([u * y - x, v * y + z], dim=1)
-    weights = torch.cat([seen.weights, seen.weights], dim=1) + 1e-4
+    weights = torch.cat([seen.weights, seen.weights], dim=1)
     free = _solve(rows, right, weights, None)
     depth = free[:, 1].median().clamp_min(10 * MIN_DEPTH)
     return _solve(rows, right, weights, depth)

@@ -1,4 +1,4 @@
-"""Two masks per frame: what is visible of the person, and the whole silhouette of the fitted body (paper section 3.1: M_t)."""
+"""Two masks per frame: what is visible of the person (paper section 3.1: M_t), and the fitted body's silhouette."""
 
 from __future__ import annotations
 

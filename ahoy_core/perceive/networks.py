@@ -1,6 +1,7 @@
 """The two TFLite networks of BlazePose, as functions of arrays.
 
-Bazarevsky et al., "BlazePose: On-device Real-time Body Pose tracking" (2020); GHUM-trained 3D variant: Grishchenko et al. (2022).
+Bazarevsky et al., "BlazePose: On-device Real-time Body Pose tracking" (2020); GHUM-trained 3D variant: Grishchenko et
+al. (2022).
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Least squares over a clip: each frame touches itself and two neighbours, a few numbers touch every frame.
 
-The normal matrix is a band of [P,P] blocks with a border of G columns. The band is factored by LAPACK, the border by a Schur complement:
-time grows linearly with the number of frames.
+The normal matrix is a band of [P,P] blocks with a border of G columns. The band is factored by LAPACK, the border by
+a Schur complement: time grows linearly with the number of frames.
 """
 
 from __future__ import annotations
@@ -67,8 +67,8 @@ def add_rows(normal: Normal, residuals: Tensor, rows: tuple[Tensor, ...], clip_r
         normal.border.index_add_(0, first + a, left.transpose(1, 2) @ clip_rows)
         for b in range(a, len(rows)):
             normal.blocks[b - a].index_add_(0, first + a, left.transpose(1, 2) @ rows[b])
-    normal.corner += torch.einsum("mrg,mrh->gh", clip_rows, clip_rows)
-    normal.clip_gradient += torch.einsum("mrg,mr->g", clip_rows, residuals)
+    normal.corner.add_(torch.einsum("mrg,mrh->gh", clip_rows, clip_rows))
+    normal.clip_gradient.add_(torch.einsum("mrg,mr->g", clip_rows, residuals))
 
 
 def solve(normal: Normal, damping: float) -> tuple[Tensor, Tensor] | None:

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 TILE_HEIGHT = 360
 MASK_TINT = (60, 200, 90)
 BONES = (
-    (11, 12), (11, 13), (13, 15), (12, 14), (14, 16), (11, 23), (12, 24), (23, 24), (23, 25), (25, 27), (24, 26), (26, 28),
-    (27, 29), (29, 31), (28, 30), (30, 32), (15, 19), (16, 20),
+    (11, 12), (11, 13), (13, 15), (12, 14), (14, 16), (11, 23), (12, 24), (23, 24), (23, 25),
+    (25, 27), (24, 26), (26, 28), (27, 29), (29, 31), (28, 30), (30, 32), (15, 19), (16, 20),
 )  # fmt: skip
 LEFT, RIGHT, UNSEEN = (255, 170, 40), (60, 170, 255), (150, 150, 150)
 
@@ -54,8 +54,9 @@ def draw_frame(
     """Return two pictures of one frame, `TILE_HEIGHT` high: mask and landmarks, and the shaded body."""
     scale = TILE_HEIGHT / frame.shape[0]
     size = (max(1, round(frame.shape[1] * scale)), TILE_HEIGHT)
-    picture = cv2.resize(frame, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
-    mask = cv2.resize(perception.visible[t], size, interpolation=cv2.INTER_LINEAR)
+    method = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
+    picture = np.asarray(cv2.resize(frame, size, interpolation=method), dtype=np.uint8)
+    mask = np.asarray(cv2.resize(perception.visible[t], size, interpolation=cv2.INTER_LINEAR), dtype=np.uint8)
     seen = draw_mask(picture, mask)
     draw_landmarks(seen, perception.landmarks[t] * np.array([scale, scale, 1.0]))
     with torch.no_grad():
@@ -79,7 +80,7 @@ def draw_mask(picture: NDArray[np.uint8], mask: NDArray[np.uint8]) -> NDArray[np
 
 
 def draw_landmarks(picture: NDArray[np.uint8], landmarks: NDArray[np.floating]) -> None:
-    """Draw bones and points [33,3] (x, y, visibility) in place: the person's left orange, right blue, hidden ones grey."""
+    """Draw bones and points [33,3] (x, y, visibility) in place: left orange, right blue, hidden ones grey."""
     points = [(round(float(x)), round(float(y))) for x, y in landmarks[:, :2]]
     for a, b in BONES:
         hidden = min(landmarks[a, 2], landmarks[b, 2]) < 0.5

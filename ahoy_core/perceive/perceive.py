@@ -37,10 +37,11 @@ class PerceiveConfig(BaseModel):
 
     Attributes:
         model: the landmark network that fills the roles pose and mask.
-        passes: readings averaged per frame: 1 forward, 2 also mirrored, 3 also backward in time, 4 backward mirrored too.
+        passes: readings averaged per frame: 1 forward, 2 also mirrored, 3 also backward in time, 4 backward mirrored
+            too.
         stride: look at every stride-th frame; the others get poses in between and count as unused.
         subject: number of the person, 0 the most prominent; None: the most prominent of each shot.
-        iterations: steps of the fit.
+        iterations: most steps in each of the fit's four stages; it stops earlier when nothing is gained.
         smoothing: weight of accelerations in the fit.
         fov_degrees: diagonal field of view assumed where no camera is given.
     """
@@ -51,7 +52,7 @@ class PerceiveConfig(BaseModel):
     passes: Literal[1, 2, 3, 4] = 2
     stride: int = Field(default=1, ge=1, le=100)
     subject: int | None = Field(default=None, ge=0)
-    iterations: int = Field(default=200, ge=1, le=10_000)
+    iterations: int = Field(default=10, ge=1, le=1000)
     smoothing: float = Field(default=1.0, ge=0.0, le=1000.0)
     fov_degrees: float = Field(default=50.0, gt=5.0, lt=150.0)
 
@@ -150,9 +151,10 @@ def perceive(
     pose, transl = spread_poses(fit.pose, fit.transl, used, pts, shots)
     soft = np.zeros((n, height, width), np.uint8)
     masks = []
-    for row, t in enumerate(looked):
-        if used[t]:
-            soft[t] = refine(frames[t], track.mask(row, height, width), track.rois[row].size)
+    for row, t in enumerate(looked.tolist()):
+        roi = track.rois[row]
+        if roi is not None:
+            soft[t] = refine(frames[t], track.mask(row, height, width), roi.size)
         report(BAR_FIT + (BAR - BAR_FIT) // 2 * (row + 1) // len(looked), BAR, "cutting the person out")
     soft[used] = hold_static(frames[used], soft[used], shots[used])
     for t in range(n):
@@ -169,9 +171,7 @@ def assumed_intrinsics(height: int, width: int, fov_degrees: float) -> NDArray[n
     return np.array([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
 
 
-def _check(
-    frames: NDArray[np.uint8], pts: NDArray[Any], shots: NDArray[Any], K: NDArray[Any] | None
-) -> None:
+def _check(frames: NDArray[np.uint8], pts: NDArray[Any], shots: NDArray[Any], K: NDArray[Any] | None) -> None:
     if frames.dtype != np.uint8 or frames.ndim != 4 or frames.shape[3] != 3 or len(frames) == 0:
         raise ValueError(f"expected frames of uint8 [T,H,W,3] with T > 0, got {frames.dtype} {frames.shape}")
     if pts.shape != (len(frames),) or shots.shape != (len(frames),):

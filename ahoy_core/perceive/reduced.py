@@ -1,8 +1,9 @@
 """The body's landmarks as a function of a few joints: what the fit differentiates instead of thousands of vertices.
 
-Skinning is linear in the rest vertices, and a landmark is a weighted sum of vertices. So landmark k of a posed body is
-sum_f T_f m_kf with the moments m_kf = sum_v w_kv W_vf [x_v; 1], and a joint that never turns relative to its parent shares its
-parent's T: fingers, toes and face fold into the joints that the fit moves. This is exact, not an approximation, for a body with plain LBS.
+Skinning is linear in the rest vertices, and a landmark is a weighted sum of vertices. So landmark k of a posed body
+is sum_f T_f m_kf with the moments m_kf = sum_v w_kv W_vf [x_v; 1], and a joint that never turns relative to its
+parent shares its parent's T: fingers, toes and face fold into the joints that the fit moves. This is exact, not an
+approximation, for a body with plain LBS.
 """
 
 from __future__ import annotations
@@ -16,7 +17,9 @@ from torch import Tensor
 from ahoy_core.body.lbs import forward_kinematics
 from ahoy_core.body.model import BodyModel
 
-SHAPE_STEP = 0.02  # of a finite difference in betas: large enough for float32, small enough for a shape space with bends
+SHAPE_STEP = (
+    0.02  # of a finite difference in betas: large enough for float32, small enough for a shape space with bends
+)
 
 
 @dataclass(frozen=True)
@@ -31,6 +34,7 @@ class ReducedBody:
         joints: [F,3] rest positions at `base_betas`.
         moment_slopes: [S,33,F,4], per unit of each beta.
         joint_slopes: [S,F,3].
+        reach: [S] metres, root mean square over the surface, per unit of each beta.
     """
 
     free: tuple[int, ...]
@@ -40,6 +44,7 @@ class ReducedBody:
     joints: Tensor
     moment_slopes: Tensor
     joint_slopes: Tensor
+    reach: Tensor
 
     def __call__(self, rotations: Tensor, transl: Tensor, betas: Tensor) -> tuple[Tensor, Tensor]:
         """Pose the landmarks.
@@ -52,8 +57,7 @@ class ReducedBody:
         Returns:
             Landmarks [T,33,3] and moving joints [T,F,3], metres, world.
         """
-        moments = self.moments + torch.einsum("s,skfc->kfc", betas - self.base_betas, self.moment_slopes)
-        rest = self.rest_joints(betas)
+        moments, rest = self.shaped_moments(betas), self.rest_joints(betas)
         transforms = forward_kinematics(rotations, rest[None], self.parents, transl)[:, :, :3]
         landmarks = torch.einsum("tfij,kfj->tki", transforms, moments)
         joints = (transforms[..., :3] @ rest[..., None])[..., 0] + transforms[..., 3]
@@ -62,6 +66,10 @@ class ReducedBody:
     def rest_joints(self, betas: Tensor) -> Tensor:
         """Rest positions [F,3] of the moving joints for a shape [S]."""
         return self.joints + torch.einsum("s,sfc->fc", betas - self.base_betas, self.joint_slopes)
+
+    def shaped_moments(self, betas: Tensor) -> Tensor:
+        """Moments [33,F,4] for a shape [S]."""
+        return self.moments + torch.einsum("s,skfc->kfc", betas - self.base_betas, self.moment_slopes)
 
     def expand(self, axis_angle: Tensor, n_joints: int) -> Tensor:
         """Spread [T,F,3] over all joints of the body, [T,J,3]; the others rest."""
@@ -88,25 +96,28 @@ def reduce_body(body: BodyModel, free: Sequence[int], betas: Tensor) -> ReducedB
     carrier = _carriers(body.parents, row)
     parents = tuple(-1 if j == 0 else carrier[body.parents[j]] for j in chosen)
     empty = betas.new_zeros(0)
-    return reshape(ReducedBody(chosen, parents, betas, empty, empty, empty, empty), body, betas)
+    return reshape(ReducedBody(chosen, parents, betas, empty, empty, empty, empty, empty), body, betas)
 
 
 def reshape(reduced: ReducedBody, body: BodyModel, betas: Tensor) -> ReducedBody:
     """Rebuild the linear shape model round other betas [S]."""
     n = len(betas)
-    step = SHAPE_STEP * torch.eye(n, dtype=betas.dtype)
+    step = SHAPE_STEP * torch.eye(n).to(betas)
     steps = torch.cat([torch.zeros_like(betas)[None], step, -step])
     carrier = torch.tensor(_carriers(body.parents, {joint: i for i, joint in enumerate(reduced.free)}))
     support, place = body.landmark_indices.unique(return_inverse=True)
     weights = betas.new_zeros(len(place), len(support)).scatter_add_(1, place, body.landmark_weights.to(betas))
     skin = betas.new_zeros(len(support), len(reduced.free)).index_add_(1, carrier, body.lbs_weights[support].to(betas))
-    moments, joints = [], []
+    like = body.default_betas
+    moments, joints, surfaces = [], [], []
     with torch.no_grad():
-        for shape in betas + steps:
-            out = body(betas.new_zeros(1, body.n_joints, 3), shape[None], betas.new_zeros(1, 3))
-            moments.append(_moments(weights, skin, out.rest_vertices[0, support]))
-            joints.append(out.rest_joints[0, list(reduced.free)])
-    m, j = torch.stack(moments), torch.stack(joints)
+        for shape in (betas + steps).to(like):
+            out = body(like.new_zeros(1, body.n_joints, 3), shape[None], like.new_zeros(1, 3))
+            moments.append(_moments(weights, skin, out.rest_vertices[0, support].to(betas)))
+            surfaces.append(out.rest_vertices[0].to(betas))
+            joints.append(out.rest_joints[0, list(reduced.free)].to(betas))
+    m, j, surface = torch.stack(moments), torch.stack(joints), torch.stack(surfaces)
+    spread = (surface[1 : n + 1] - surface[n + 1 :]) / (2 * SHAPE_STEP)
     return replace(
         reduced,
         base_betas=betas.detach().clone(),
@@ -114,6 +125,7 @@ def reshape(reduced: ReducedBody, body: BodyModel, betas: Tensor) -> ReducedBody
         joints=j[0],
         moment_slopes=(m[1 : n + 1] - m[n + 1 :]) / (2 * SHAPE_STEP),
         joint_slopes=(j[1 : n + 1] - j[n + 1 :]) / (2 * SHAPE_STEP),
+        reach=spread.square().sum(-1).mean(-1).sqrt(),
     )
 
 

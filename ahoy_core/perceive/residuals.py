@@ -1,7 +1,7 @@
-"""What the fit minimises: residuals in metres or radians over their standard deviations, smooth and finite everywhere.
+"""What the fit minimises: distances in metres over their standard deviations, finite everywhere.
 
-Image errors are measured in metres at the person's depth: one set of standard deviations holds for every picture size and
-distance.
+Image errors are measured in metres at the person's depth: one set of standard deviations holds for every picture size
+and distance.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-LANDMARK_SPREAD = 0.04  # metres: agreement of a visible landmark with the body's, across the line of sight
+LANDMARK_SPREAD = 0.05  # metres: agreement of a visible landmark with the body's, across the line of sight
 WORLD_SPREAD = 0.15  # metres: of the network's own 3D, which is much weaker along the line of sight
 MIN_DEPTH = 0.1  # metres: nearer points, and those behind, project as if they were about there
 
@@ -42,60 +42,89 @@ def geman_mcclure(squared: Tensor, scale: float) -> Tensor:
     return squared * scale**2 / (squared + scale**2)
 
 
-def image_offsets(landmarks: Tensor, seen: Observations) -> Tensor:
+def geman_mcclure_weight(squared: Tensor, scale: float) -> Tensor:
+    """Its derivative, in (0,1]: the weight of a residual in reweighted least squares."""
+    return (scale**2 / (squared + scale**2)) ** 2
+
+
+def safe_depth(depth: Tensor) -> Tensor:
+    """The depth itself from a few `MIN_DEPTH` on; below it bends smoothly towards `MIN_DEPTH` and never reaches it."""
+    return MIN_DEPTH * (1.0 + torch.nn.functional.softplus(depth / MIN_DEPTH - 1.0))
+
+
+def person_depth(landmarks: Tensor) -> Tensor:
+    """Depth [N] that turns image errors into metres: the landmarks' mean, held constant while a step is sought."""
+    return landmarks[..., 1].detach().mean(-1).clamp_min(MIN_DEPTH)
+
+
+def image_offsets(landmarks: Tensor, seen: Observations, person: Tensor) -> Tensor:
     """Offsets [N,33,2] between projected and seen landmarks, in metres at the person's depth.
 
     Args:
         landmarks: [N,33,3] world, seen by `OBSERVED_VIEWMAT` (x_cam = x, y_cam = -z, depth = y).
         seen: the observations.
+        person: [N] metres, see `person_depth`.
     """
-    depth = landmarks[..., 1]
-    safe = MIN_DEPTH * (1.0 + torch.nn.functional.softplus(depth / MIN_DEPTH - 1.0))
-    plane = torch.stack([landmarks[..., 0], -landmarks[..., 2]], dim=-1) / safe[..., None]
+    plane = torch.stack([landmarks[..., 0], -landmarks[..., 2]], dim=-1) / safe_depth(landmarks[..., 1])[..., None]
     focal = torch.stack([seen.K[0, 0], seen.K[1, 1]])
     rays = (seen.points - seen.K[:2, 2]) / focal
-    person = depth.detach().mean(-1).clamp_min(MIN_DEPTH)
     return (plane - rays) * person[:, None, None]
 
 
-def image_cost(landmarks: Tensor, seen: Observations, scale: float) -> Tensor:
-    """Robust reprojection cost [N]; `scale` in metres is where a landmark begins to count as wrong."""
-    squared = image_offsets(landmarks, seen).square().sum(-1)
-    return (seen.weights * geman_mcclure(squared, scale)).sum(-1) / LANDMARK_SPREAD**2
+def image_derivatives(landmarks: Tensor, person: Tensor) -> Tensor:
+    """Derivatives [N,33,2,3] of `image_offsets` by the landmarks."""
+    depth = landmarks[..., 1]
+    inverse = person[:, None] / safe_depth(depth)
+    bend = torch.sigmoid(depth / MIN_DEPTH - 1.0) * inverse / safe_depth(depth)
+    zero = torch.zeros_like(inverse)
+    across = torch.stack([inverse, -landmarks[..., 0] * bend, zero], dim=-1)
+    down = torch.stack([zero, landmarks[..., 2] * bend, -inverse], dim=-1)
+    return torch.stack([across, down], dim=-2)
 
 
-def world_cost(landmarks: Tensor, seen: Observations, log_scale: Tensor, scale: float) -> Tensor:
-    """Robust cost [N] of the network's 3D, relative to the weighted mean; its metre is off by one factor a video.
+def centred(points: Tensor, weights: Tensor) -> Tensor:
+    """Points [N,33,...] less their weighted mean; nothing is taken off where all weights are 0."""
+    share = weights / weights.sum(1, keepdim=True).clamp_min(1e-6)
+    flat = points.flatten(2)
+    return (flat - (share[..., None] * flat).sum(1, keepdim=True)).reshape(points.shape)
 
-    Args:
-        landmarks: [N,33,3] world.
-        seen: the observations.
-        log_scale: [] logarithm of that factor.
-        scale: metres.
+
+def world_offsets(landmarks: Tensor, seen: Observations, log_scale: Tensor) -> Tensor:
+    """Offsets [N,33,3] in metres between the body's 3D and the network's, scaled, each about its mean."""
+    return centred(landmarks, seen.weights) - log_scale.exp() * centred(seen.world, seen.weights)
+
+
+@dataclass(frozen=True)
+class Differences:
+    """Finite differences in time for any spacing, within shots.
+
+    Attributes:
+        speed_first: [M1] first frame of each pair of neighbours.
+        speed: [M1,2] coefficients in 1/s.
+        bend_first: [M2] first frame of each triple.
+        bend: [M2,3] coefficients in 1/s^2.
     """
-    weights = seen.weights[..., None]
-    total = weights.sum(1, keepdim=True).clamp_min(1e-6)
-    ours = landmarks - (weights * landmarks).sum(1, keepdim=True) / total
-    theirs = seen.world - (weights * seen.world).sum(1, keepdim=True) / total
-    squared = (ours - log_scale.exp() * theirs).square().sum(-1)
-    return (seen.weights * geman_mcclure(squared, scale)).sum(-1) / WORLD_SPREAD**2
+
+    speed_first: Tensor
+    speed: Tensor
+    bend_first: Tensor
+    bend: Tensor
 
 
-def acceleration(joints: Tensor, seen: Observations) -> Tensor:
-    """Accelerations [M,F,3] in m/s^2 at frames whose two neighbours belong to the same shot, for any spacing in time.
-
-    Args:
-        joints: [N,F,3] world.
-        seen: the observations.
-    """
+def differences(seen: Observations) -> Differences:
+    """Set up speeds and accelerations between neighbouring frames of one shot."""
     gaps = (seen.times[1:] - seen.times[:-1]).clamp_min(1e-3)
-    velocity = (joints[1:] - joints[:-1]) / gaps[:, None, None]
-    change = (velocity[1:] - velocity[:-1]) * 2.0 / (gaps[1:] + gaps[:-1])[:, None, None]
-    inside = (seen.shot[2:] == seen.shot[1:-1]) & (seen.shot[1:-1] == seen.shot[:-2])
-    return change[inside]
+    same = seen.shot[1:] == seen.shot[:-1]
+    pairs = same.nonzero()[:, 0]
+    triples = (same[1:] & same[:-1]).nonzero()[:, 0]
+    before, after = gaps[triples], gaps[triples + 1]
+    near, far = 2 / (before * (before + after)), 2 / (after * (before + after))
+    rate = 1 / gaps[pairs]
+    return Differences(pairs, torch.stack([-rate, rate], 1), triples, torch.stack([near, -near - far, far], 1))
 
 
-def depth_velocity(points: Tensor, seen: Observations) -> Tensor:
-    """Speeds [M] in m/s along the line of sight (world y), between neighbouring frames of one shot; points [N,3]."""
-    gaps = (seen.times[1:] - seen.times[:-1]).clamp_min(1e-3)
-    return ((points[1:, 1] - points[:-1, 1]) / gaps)[seen.shot[1:] == seen.shot[:-1]]
+def apply_differences(values: Tensor, first: Tensor, coefficients: Tensor) -> Tensor:
+    """Combine successive frames: values [N,...] -> [M,...]."""
+    shape = (-1,) + (1,) * (values.ndim - 1)
+    parts = [coefficients[:, i].reshape(shape) * values[first + i] for i in range(coefficients.shape[1])]
+    return torch.stack(parts).sum(0)

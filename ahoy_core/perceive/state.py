@@ -1,7 +1,7 @@
 """What the fit solves for, and how landmarks and joints move with it: exact derivatives, by hand.
 
-A joint's turn moves everything below it about that joint, so a landmark's derivative is a cross product with its lever arm. That costs
-one pass for all parameters, where automatic differentiation takes one pass for each row.
+A joint's turn moves everything below it about that joint, so a landmark's derivative is a cross product with its
+lever arm. That costs one pass for all parameters, where automatic differentiation takes one pass for each row.
 """
 
 from __future__ import annotations
@@ -88,16 +88,17 @@ def linearise(reduced: ReducedBody, state: State) -> Linearised:
     turned = transforms[..., :3]
     joints = (turned @ rest[..., None])[..., 0] + transforms[..., 3]
     parts = torch.einsum("nfij,kfj->nkfi", transforms, moments)
-    below = _below(reduced.parents).to(rest)
-    share = moments[..., 3] @ below.T
-    lever = torch.einsum("fg,nkgi->nkfi", below, parts) - share[None, :, :, None] * joints[:, None]
-    joint_lever = (joints[:, :, None] - joints[:, None]) * below.T[None, :, :, None]
+    under = below(reduced.parents).to(rest)
+    share = moments[..., 3] @ under.T
+    lever = torch.einsum("fg,nkgi->nkfi", under, parts) - share[None, :, :, None] * joints[:, None]
+    joint_lever = (joints[:, :, None] - joints[:, None]) * under.T[None, :, :, None]
     turning = turned @ right_jacobian(state.angles)
+    landmarks_by_shape, joints_by_shape = _by_shape(reduced, rotations, moments[..., 3])
     return Linearised(
         landmarks=parts.sum(2),
         joints=joints,
-        d_landmarks=_columns(lever, turning, _by_shape(reduced, rotations, moments[..., 3])[0]),
-        d_joints=_columns(joint_lever, turning, _by_shape(reduced, rotations, moments[..., 3])[1]),
+        d_landmarks=_columns(lever, turning, landmarks_by_shape),
+        d_joints=_columns(joint_lever, turning, joints_by_shape),
     )
 
 
@@ -121,7 +122,7 @@ def _columns(lever: Tensor, turning: Tensor, by_shape: Tensor) -> Tensor:
 
 
 def _by_shape(reduced: ReducedBody, rotations: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """Derivatives by betas with the root joint held: landmarks [N,33,3,S] and joints [N,F,3,S] (both are linear in the shape)."""
+    """Derivatives by betas, the root joint held, of landmarks [N,33,3,S] and joints [N,F,3,S]: both are linear in them."""
     landmarks, joints = [], []
     for moment, rest in zip(reduced.moment_slopes, reduced.joint_slopes, strict=True):
         shift = -rest[:1].expand(len(rotations), -1)
@@ -132,7 +133,7 @@ def _by_shape(reduced: ReducedBody, rotations: Tensor, weights: Tensor) -> tuple
     return torch.stack(landmarks, -1), torch.stack(joints, -1)
 
 
-def _below(parents: tuple[int, ...]) -> Tensor:
+def below(parents: tuple[int, ...]) -> Tensor:
     """[F,F] bool: column joint is the row joint or below it."""
     result = torch.eye(len(parents), dtype=torch.bool)
     for joint in range(len(parents) - 1, 0, -1):

@@ -1,8 +1,8 @@
-"""What a still camera gives away: a pixel that shows the same colour as before can't have turned from furniture into a person.
+"""What a still camera gives away: a pixel that looks as before can't have turned from furniture into a person.
 
-The networks' masks spill over furniture in front of a person, here in one frame, there in another, while those pixels never change. So
-wherever a pixel shows its usual colour, its mask is held at or below a low quantile of the values it got when it looked like that.
-With a moving camera few pixels keep a usual colour, and nothing happens.
+The networks' masks spill over furniture in front of a person, here in one frame, there in another, while those pixels
+never change. So wherever a pixel shows its usual colour, its mask is held at or below a low quantile of the values it
+got when it looked like that. With a moving camera few pixels keep a usual colour, and nothing happens.
 """
 
 from __future__ import annotations
@@ -18,9 +18,7 @@ SMOOTHING = 1.5  # pixels
 QUANTILE = 0.1
 
 
-def hold_static(
-    frames: NDArray[np.uint8], masks: NDArray[np.uint8], shots: NDArray[np.integer]
-) -> NDArray[np.uint8]:
+def hold_static(frames: NDArray[np.uint8], masks: NDArray[np.uint8], shots: NDArray[np.integer]) -> NDArray[np.uint8]:
     """Lower masks where a pixel looks as usual but was not always taken for the person.
 
     Args:
@@ -50,9 +48,7 @@ def _looks_usual(frame: NDArray[np.uint8], usual: NDArray[np.float32]) -> NDArra
     return np.asarray(np.abs(difference).max(axis=-1) < SAME_COLOUR)
 
 
-def _ceiling(
-    frames: NDArray[np.uint8], masks: NDArray[np.uint8], usual: NDArray[np.float32]
-) -> NDArray[np.uint8]:
+def _ceiling(frames: NDArray[np.uint8], masks: NDArray[np.uint8], usual: NDArray[np.float32]) -> NDArray[np.uint8]:
     """Low quantile [H,W] of the masks over the frames in which the pixel looks as usual; 255 where it rarely does."""
     same = np.stack([_looks_usual(frame, usual) for frame in frames])
     # Frames that look different sort to the end, so the quantile is a row of the sorted stack.

@@ -84,7 +84,7 @@ def joint_confidence(landmarks: Tensor, joints: Tensor, confidence: Tensor) -> T
     """
     squared = torch.cdist(joints, landmarks).square() / JOINT_REACH**2
     weights = torch.softmax(-0.5 * squared, dim=1)
-    return (confidence @ weights.T).clamp(0.0, 1.0)
+    return (confidence @ weights.T.to(confidence)).clamp(0.0, 1.0)
 
 
 def frame_confidence(confidence: Tensor) -> Tensor:

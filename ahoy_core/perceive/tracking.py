@@ -76,8 +76,9 @@ def _distance(a: Roi, b: Roi) -> float:
 def choose(tracks: list[Track], shot: np.ndarray, subject: int | None) -> Track:
     """Pick the subject: the most prominent track, or the K-th most prominent.
 
-    A cut ends every track. The default subject goes on in other shots with the most prominent person there, so that a clip with
-    cuts of one person is used whole; a subject asked for by number stays within its shot, as nothing tells who is who after a cut.
+    A cut ends every track. The default subject goes on in other shots with the most prominent person there, so that a
+    clip with cuts of one person is used whole; a subject asked for by number stays within its shot, as nothing tells
+    who is who after a cut.
 
     Args:
         tracks: most prominent first.

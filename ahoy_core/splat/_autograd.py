@@ -16,8 +16,9 @@ from ahoy_core.splat._camera import View, pack_cameras
 from ahoy_core.splat._plan import Plan, Tiling, make_plan, padded_channels
 from ahoy_core.splat._project import project_forward
 from ahoy_core.splat._project_backward import project_backward
-from ahoy_core.splat._simd import LANES, sums_width
-from ahoy_core.splat._threads import run_parts, split
+from ahoy_core.splat._reductions import sums_width
+from ahoy_core.splat._threads import run_parts, run_spans, split
+from ahoy_core.splat._vectors import LANES
 from ahoy_core.splat.constants import ALPHA_MAX
 
 Array = NDArray[Any]
@@ -56,32 +57,31 @@ class _Project(torch.autograd.Function):
         features: Tensor, cameras: Array, antialiased: bool, threads: int,
     ) -> tuple[Tensor, ...]:  # fmt: skip
         count, total = len(cameras), len(means)
-        empty = {"dtype": opacities.dtype}
-        out = [torch.empty((count, total, k), **empty) for k in (2, 2, 3, 3)]
-        means2d, residuals, conics, factors = out
-        depths = torch.empty((count, total), **empty)
-        compensations = torch.empty((count if antialiased else 0, total), **empty)
-        radii = torch.empty((count, total, 2), dtype=torch.int32)
-        keys, invalid = torch.empty((count, total), dtype=torch.float64), torch.zeros(total, dtype=torch.bool)
+        means2d, residuals, conics, factors = (opacities.new_empty(count, total, k) for k in (2, 2, 3, 3))
+        depths, compensations = (
+            opacities.new_empty(count, total),
+            opacities.new_empty(count if antialiased else 0, total),
+        )
+        radii, invalid = torch.empty((count, total, 2), dtype=torch.int32), torch.zeros(total, dtype=torch.bool)
+        keys = torch.empty((count, total), dtype=torch.float64)
         spans = split(total, threads)
         inputs = [_numpy(t) for t in (means, quats, scales, covars, opacities)]
+        outputs = [_numpy(t) for t in (radii, means2d, residuals, depths, conics, factors, compensations, keys)]
+        seen, marks = _numpy(features), _numpy(invalid)
         for c in range(count):
-            own = _numpy(features if features.dim() == 2 else features[c])
-            rows = [_numpy(t[c] if len(t) else t) for t in (radii, means2d, residuals, depths, conics, factors)]
-            rows += [_numpy(compensations[c] if antialiased else depths[c]), _numpy(keys[c]), _numpy(invalid)]
-            negative = run_parts(
-                lambda p, c=c, own=own, rows=rows: project_forward(
-                    *spans[p], cameras[c], antialiased, *inputs, own, *rows
-                ),
-                len(spans),
-            )
+            own = [
+                seen if seen.ndim == 2 else seen[c],
+                *(out[c] if len(out) else out.ravel() for out in outputs),
+                marks,
+            ]
+            negative = run_spans(project_forward, spans, cameras[c], antialiased, *inputs, *own)
             if max(negative) >= 0:
                 row = max(negative)
                 raise ValueError(
                     f"scales: expected values >= 0, got {scales[row].tolist()} in row {row}; scales are standard "
                     "deviations, take exp() of log-scales first"
                 )
-        ctx.save_for_backward(means, quats, scales, covars, radii)
+        ctx.save_for_backward(means, quats, scales, covars, opacities, radii)
         ctx.cameras, ctx.spans, ctx.view_dtype = cameras, spans, viewmats.dtype
         ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(radii, residuals, keys, invalid)
@@ -90,25 +90,19 @@ class _Project(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Any, ...]:
-        means, quats, scales, covars, radii = ctx.saved_tensors
+        means, quats, scales, covars, opacities, radii = ctx.saved_tensors
         v_inputs = [torch.zeros_like(t) for t in (means, quats, scales, covars)]
-        inputs, outputs = [_numpy(t) for t in (means, quats, scales, covars)], [_numpy(t) for t in v_inputs]
+        inputs = [_numpy(t) for t in (means, quats, scales, covars, opacities)]
+        outputs, seen = [_numpy(t) for t in v_inputs], _numpy(radii)
         pose = np.zeros((len(ctx.spans), len(ctx.cameras), 12))
-        sizes = ((2,), (), (3,), (3,), ())
+        dtype = inputs[4].dtype
+        nothing = [np.empty((0, *size), dtype) for size in ((2,), (), (3,), (3,), ())]
+        given = [None if g is None or len(g) == 0 else _numpy(g.contiguous()) for g in grads[:5]]
         for c in range(len(ctx.cameras)):
-            v = [
-                _numpy(_rows(size, quats) if g is None or len(g) == 0 else g[c].contiguous())
-                for g, size in zip(grads[:5], sizes, strict=True)
-            ]
-            own = _numpy(radii[c])
-            run_parts(
-                lambda p, c=c, v=v, own=own: project_backward(
-                    *ctx.spans[p], ctx.cameras[c], *inputs, own, *v, *outputs, pose[p, c]
-                ),
-                len(ctx.spans),
-            )
-        v_viewmats = np.zeros((len(ctx.cameras), 4, 4))
-        summed = pose.sum(0)
+            v = [none if g is None else g[c] for g, none in zip(given, nothing, strict=True)]
+            fixed = [ctx.cameras[c], *inputs, seen[c], *v, *outputs]
+            run_spans(project_backward, ctx.spans, *fixed, each=pose[:, c])
+        v_viewmats, summed = np.zeros((len(ctx.cameras), 4, 4)), pose.sum(0)
         v_viewmats[:, :3, :3], v_viewmats[:, :3, 3] = summed[:, :9].reshape(-1, 3, 3), summed[:, 9:]
         return *v_inputs, torch.from_numpy(v_viewmats).to(ctx.view_dtype), *(None,) * 5
 
@@ -134,7 +128,7 @@ def project(
     Raises:
         ValueError: If a scale is negative.
     """
-    cameras = pack_cameras(_numpy(viewmats.double()), _numpy(Ks.double()), view)
+    cameras = pack_cameras(_numpy(viewmats), _numpy(Ks), view)
     quats, scales = (_rows((4,), opacities), _rows((3,), opacities)) if covars is not None else (quats, scales)
     covars = _rows((3, 3), opacities) if covars is None else covars
     return Projected(
@@ -164,10 +158,12 @@ def _scratch(size: int, dtype: Any) -> Array:
     return room[start : start + size]
 
 
-def _padded_background(backgrounds: Tensor | None, c: int, channels: int, dtype: Any) -> Array:
-    if backgrounds is None:
-        return np.zeros(channels, dtype)
-    return _numpy(backgrounds[c])
+def _background(backgrounds: Tensor | None, c: int, channels: int, dtype: Any) -> Array:
+    """Background of one camera, padded with zeros to the channels that kernels are compiled for."""
+    padded = np.zeros(padded_channels(channels), dtype)
+    if backgrounds is not None:
+        padded[:channels] = _numpy(backgrounds[c])
+    return padded
 
 
 class _Blend(torch.autograd.Function):
@@ -177,86 +173,84 @@ class _Blend(torch.autograd.Function):
         residuals: Tensor, radii: Tensor, order_keys: Tensor, blending: Blending, plans: list[Plan],
     ) -> tuple[Tensor, Tensor]:  # fmt: skip
         count, channels, tiling = len(means2d), features.shape[-1], blending.tiling
-        image = torch.empty((count, tiling.height, tiling.width, channels), dtype=features.dtype)
-        alphas = torch.empty((count, tiling.height, tiling.width, 1), dtype=features.dtype)
-        dtype = _numpy(image).dtype
-        grid, limits, like = tiling.grid(dtype), blending.limits(dtype), (0.0,) * padded_channels(channels)
-        tiles = tiling.tiles_x * tiling.tiles_y
-        kept = tiles if any(ctx.needs_input_grad) else 0
-        ctx.rests, ctx.lasts = [], []
+        image = features.new_empty(count, tiling.height, tiling.width, channels)
+        alphas = features.new_empty(count, tiling.height, tiling.width, 1)
+        inputs = [_numpy(t) for t in (radii, means2d, residuals, factors, opacities)]
+        own, keys, colors, coverage = (_numpy(t) for t in (features, order_keys, image, alphas))
+        log2_cutoff, keep, ctx.kept = float(np.log2(blending.alpha_cutoff)), any(ctx.needs_input_grad), []
         for c in range(count):
-            own = _numpy(features if features.dim() == 2 else features[c])
-            plan = make_plan(
-                tiling, *(_numpy(t[c]) for t in (radii, means2d, residuals, factors, opacities)), own,
-                _numpy(order_keys[c]), float(limits[0]), blending.budget, blending.threads,
-            )  # fmt: skip
+            mine = own if own.ndim == 2 else own[c]
+            seen, limits = [x[c] for x in inputs], (log2_cutoff, blending.budget, blending.threads)
+            plan = make_plan(tiling, seen, mine, keys[c], *limits)
             plans.append(plan)
-            rests = np.empty((kept, tiling.tile_size**2), dtype)
-            lasts = np.empty((kept, tiling.tile_size**2), np.int32)
-            background = _padded_background(backgrounds, c, channels, dtype)
-            parts = min(blending.threads, tiles)
-            run_parts(
-                lambda p, c=c, plan=plan, rests=rests, lasts=lasts, background=background, parts=parts: (
-                    _blend.blend_forward(
-                        p, parts, plan.starts, plan.ids, plan.masks, plan.records, grid, tiling.tile_size, like, limits,
-                        background, _numpy(image[c]), _numpy(alphas[c]), rests, lasts,
-                        _scratch((len(grid) - 32) // 2 * (2 + len(like)) * LANES, dtype), _scratch(2 * LANES, dtype),
-                    )
-                ),
-                parts,
-            )  # fmt: skip
-            ctx.rests.append(rests)
-            ctx.lasts.append(lasts)
-        ctx.save_for_backward(opacities, features, backgrounds)
+            ctx.kept.append(_render(blending, plan, _background(backgrounds, c, channels, own.dtype), colors[c],
+                                    coverage[c], keep))  # fmt: skip
+        ctx.save_for_backward(factors, opacities, features, backgrounds)
         ctx.blending, ctx.plans = blending, list(plans)
         return image, alphas
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, v_image: Tensor, v_alphas: Tensor) -> tuple[Any, ...]:
-        opacities, features, backgrounds = ctx.saved_tensors
-        count, rows = len(ctx.plans), opacities.shape[1]
-        v_means2d, v_factors = (torch.zeros((count, rows, k), dtype=features.dtype) for k in (2, 3))
-        v_opacities, v_features = torch.zeros_like(opacities), torch.zeros_like(features)
-        v_image, v_alphas = v_image.contiguous(), v_alphas.contiguous()
-        v_backgrounds = np.zeros((count, features.shape[-1]))
-        for c in range(count):
-            plan = ctx.plans[c]
-            sums, v_backgrounds[c] = _moments(ctx, c, _numpy(v_image[c]), _numpy(v_alphas[c]), backgrounds)
-            spans = split(rows, ctx.blending.threads)
-            own = _numpy(v_features if features.dim() == 2 else v_features[c])
-            out = [_numpy(t[c]) for t in (v_means2d, v_factors, v_opacities)]
-            run_parts(
-                lambda p, c=c, plan=plan, sums=sums, own=own, out=out, spans=spans: _blend_backward.gather_gradients(
-                    *spans[p], plan.slots, plan.records, _numpy(opacities[c]), sums, *out, own
-                ),
-                len(spans),
+        factors, opacities, features, backgrounds = ctx.saved_tensors
+        count, rows, channels = len(ctx.plans), opacities.shape[1], features.shape[-1]
+        v_means2d, v_factors = (features.new_empty(count, rows, k) for k in (2, 3))
+        v_opacities, v_features = features.new_empty(count, rows), torch.zeros_like(features)
+        outputs, own = [_numpy(t) for t in (v_means2d, v_factors, v_opacities)], _numpy(v_features)
+        inputs, pixels = (
+            [_numpy(t) for t in (factors, opacities)],
+            [_numpy(t.contiguous()) for t in (v_image, v_alphas)],
+        )
+        v_backgrounds, spans = np.zeros((count, channels)), split(rows, ctx.blending.threads)
+        for c, plan in enumerate(ctx.plans):
+            background = _background(backgrounds, c, channels, own.dtype)
+            has_background = backgrounds is not None
+            sums, v_backgrounds[c] = _moments(
+                ctx.blending, plan, ctx.kept[c], background, pixels[0][c], pixels[1][c], has_background
             )
+            arrays = [*(x[c] for x in inputs), sums, *(x[c] for x in outputs), own if own.ndim == 2 else own[c]]
+            run_spans(_blend_backward.gather_gradients, spans, plan.slots, *arrays)
         v_back = None if backgrounds is None else torch.from_numpy(v_backgrounds).to(backgrounds.dtype)
         return v_means2d, v_factors, v_opacities, v_features, v_back, *(None,) * 5
 
 
-def _moments(ctx: Any, c: int, v_image: Array, v_alphas: Array, backgrounds: Tensor | None) -> tuple[Array, Array]:
-    """Moments of one camera [P,M,6+D] and the gradient of its background [D]."""
-    blending, plan = ctx.blending, ctx.plans[c]
-    channels, dtype = v_image.shape[2], v_image.dtype
-    grid, limits = blending.tiling.grid(dtype), blending.limits(dtype)
-    like = (0.0,) * padded_channels(channels)
-    parts = min(blending.threads, len(plan.starts) - 1)
-    width = sums_width(_blend_backward.MOMENTS + len(like))
-    sums = np.zeros((parts, len(plan.records), width), dtype)
-    background = _padded_background(backgrounds, c, channels, dtype)
-    v_background = np.zeros((parts, channels if backgrounds is not None else 0))
+def _render(
+    blending: Blending, plan: Plan, background: Array, image: Array, alphas: Array, keep: bool
+) -> tuple[Array, Array]:
+    """Blend one camera into image [H,W,D] and alphas [H,W,1]; returns what its backward pass needs, if kept."""
+    tiling, dtype, tiles = blending.tiling, image.dtype, len(plan.starts) - 1
+    grid, limits, like = tiling.grid(dtype), blending.limits(dtype), (0.0,) * len(background)
+    rests = np.empty((tiles if keep else 0, tiling.tile_size**2), dtype)
+    lasts = np.empty(rests.shape, np.int32)
+    parts, size = min(blending.threads, tiles), tiling.tile_size**2 * (2 + len(like))
     run_parts(
-        lambda p: _blend_backward.blend_backward(
-            p, parts, plan.starts, plan.ids, plan.masks, plan.records, grid, blending.tiling.tile_size, like, limits,
-            background, v_image, v_alphas, ctx.rests[c], ctx.lasts[c],
-            _scratch((len(grid) - 32) // 2 * (2 + len(like)) * LANES, dtype), _scratch(2 * LANES, dtype), sums[p],
-            v_background[p],
+        lambda p: _blend.blend_forward(
+            p, parts, plan.starts, plan.ids, plan.masks, plan.records, grid, tiling.tile_size, like, limits, background,
+            image, alphas, rests, lasts, _scratch(size, dtype), _scratch(2 * LANES, dtype),
         ),
         parts,
     )  # fmt: skip
-    return sums, v_background.sum(0) if backgrounds is not None else np.zeros(channels)
+    return rests, lasts
+
+
+def _moments(
+    blending: Blending, plan: Plan, kept: tuple[Array, Array], background: Array, v_image: Array, v_alphas: Array,
+    has_background: bool,
+) -> tuple[Array, Array]:  # fmt: skip
+    """Moments of one camera [P,M,6+D] and the gradient of its background [D]."""
+    tiling, dtype, tiles = blending.tiling, v_image.dtype, len(plan.starts) - 1
+    grid, limits, like = tiling.grid(dtype), blending.limits(dtype), (0.0,) * len(background)
+    parts, size = min(blending.threads, tiles), tiling.tile_size**2 * (2 + len(like))
+    sums = np.zeros((parts, len(plan.records), sums_width(_blend_backward.MOMENTS + len(like))), dtype)
+    v_background = np.zeros((parts, v_image.shape[2] if has_background else 0))
+    run_parts(
+        lambda p: _blend_backward.blend_backward(
+            p, parts, plan.starts, plan.ids, plan.masks, plan.records, grid, tiling.tile_size, like, limits, background,
+            v_image, v_alphas, *kept, _scratch(size, dtype), _scratch(2 * LANES, dtype), sums[p], v_background[p],
+        ),
+        parts,
+    )  # fmt: skip
+    return sums, v_background.sum(0) if has_background else np.zeros(v_image.shape[2])
 
 
 def blend(

@@ -13,14 +13,15 @@ from typing import Any, Final
 import numpy as np
 
 from ahoy_core.splat._jit import kernel
-from ahoy_core.splat._simd import bits, fma, load, maximum, minimum, prefetch, splat
+from ahoy_core.splat._powers import log2, sqrt
+from ahoy_core.splat._simd import bits, fma, load, maximum, minimum, prefetch, splat, store
+from ahoy_core.splat._vectors import LANES
 from ahoy_core.splat.constants import SLACK
 
 HEAD: Final = 8
 """Values of a record before its channels: mean (2), what rounding took from it (2), factors a, b, c, log2 opacity."""
 
 _MAX_RADIX: Final = 2048
-_AHEAD: Final = 8
 
 
 @kernel
@@ -68,24 +69,34 @@ def pack_records(
 ) -> None:  # fmt: skip
     """Write the records of rows [start, stop); sequence[first:] lists their slots in the order of the input."""
     channels, stride = features.shape[1], records.shape[1]
-    for i in range(start, stop):
-        slots[i] = -1
-        if radii[i, 0] <= 0:
-            continue
-        tile = home_tile(means2d[i, 0], means2d[i, 1], tile_size, tiles_x, tiles_y)
-        slot = cursors[tile]
-        cursors[tile] += 1
-        slots[i], owners[slot], keys[slot], sequence[first] = slot, i, order_keys[i], slot
-        first += 1
-        for k in range(2):
-            records[slot, k], records[slot, 2 + k] = means2d[i, k], residuals[i, k]
-        for k in range(3):
-            records[slot, 4 + k] = factors[i, k]
-        records[slot, 7] = math.log2(float(opacities[i]))
-        for k in range(channels):
-            records[slot, HEAD + k] = features[i, k]
-        for k in range(HEAD + channels, stride):
-            records[slot, k] = 0.0
+    levels, places = np.ones(LANES), np.empty(LANES, np.int64)
+    for i in range(start, stop, LANES):
+        count = min(LANES, stop - i)
+        for lane in range(count):
+            places[lane], levels[lane], row = -1, 1.0, i + lane
+            if radii[row, 0] > 0:
+                tile = home_tile(means2d[row, 0], means2d[row, 1], tile_size, tiles_x, tiles_y)
+                places[lane], levels[lane] = cursors[tile], opacities[row]
+                cursors[tile] += 1
+                prefetch(records, places[lane] * stride)
+                prefetch(records, (places[lane] + 1) * stride - 1)
+        store(levels, 0, log2(load(levels, 0)))
+        for lane in range(count):
+            slot, row = places[lane], i + lane
+            slots[row] = slot
+            if slot < 0:
+                continue
+            owners[slot], keys[slot], sequence[first] = row, order_keys[row], slot
+            first += 1
+            for k in range(2):
+                records[slot, k], records[slot, 2 + k] = means2d[row, k], residuals[row, k]
+            for k in range(3):
+                records[slot, 4 + k] = factors[row, k]
+            records[slot, 7] = levels[lane]
+            for k in range(channels):
+                records[slot, HEAD + k] = features[row, k]
+            for k in range(HEAD + channels, stride):
+                records[slot, k] = 0.0
 
 
 @kernel
@@ -183,6 +194,26 @@ def _grown(array: Any) -> Any:
 
 
 @kernel
+def plan_search(k: int, count: int, order: Any, records: Any, log2_cutoff: float, scratch: Any) -> None:
+    """Columns for order[k], ..., order[k + count - 1]: mean (2), reach (2), slopes (2) and limit of `block_mask`."""
+    for lane in range(count):
+        slot = order[k + lane]
+        for axis in range(2):
+            scratch[axis * LANES + lane] = float(records[slot, axis]) + float(records[slot, 2 + axis])
+        for m in range(4):
+            scratch[(2 + m) * LANES + lane] = records[slot, 4 + m]
+    a, b, c = load(scratch, 2 * LANES), load(scratch, 3 * LANES), load(scratch, 4 * LANES)
+    limit = maximum(load(scratch, 5 * LANES) - log2_cutoff, 0.0) * (1.0 + SLACK) + SLACK
+    norm, inverse_a = b * b + c * c, 1.0 / a
+    radius = sqrt(limit * (1.0 + SLACK)) / c
+    store(scratch, 2 * LANES, radius * sqrt(norm) * inverse_a)
+    store(scratch, 3 * LANES, radius)
+    store(scratch, 4 * LANES, -a * b / norm)
+    store(scratch, 5 * LANES, -b * inverse_a)
+    store(scratch, 6 * LANES, limit)
+
+
+@kernel
 def find_tiles(
     start: int, stop: int, order: Any, records: Any, grid: Any, log2_cutoff: float, tile_size: int, tiles_x: int,
     tiles_y: int, budget: int, counts: Any, per_slot: Any, mask_like: Any,
@@ -192,20 +223,19 @@ def find_tiles(
     tiles, masks, found = np.empty(room, np.int32), np.empty(room, mask_like.dtype), 0
     groups = max(1, (tile_size // 4) ** 2 // 16)
     valid = np.uint64(0xF) if tile_size == 8 else np.uint64(0xFFFF)
+    scratch = np.ones(7 * LANES)
     for k in range(start, stop):
-        if k + _AHEAD < stop:
-            prefetch(records, order[k + _AHEAD] * records.shape[1])
-            prefetch(records, order[k + _AHEAD] * records.shape[1] + HEAD - 1)
+        lane = (k - start) % LANES
+        if lane == 0:
+            for ahead in range(min(k + LANES, stop), min(k + 2 * LANES, stop)):
+                prefetch(records, order[ahead] * records.shape[1])
+                prefetch(records, order[ahead] * records.shape[1] + HEAD - 1)
+            plan_search(k, min(LANES, stop - k), order, records, log2_cutoff, scratch)
         slot, before = order[k], found
-        x, y = float(records[slot, 0]) + float(records[slot, 2]), float(records[slot, 1]) + float(records[slot, 3])
-        a, b, c = float(records[slot, 4]), float(records[slot, 5]), float(records[slot, 6])
-        limit = (float(records[slot, 7]) - log2_cutoff) * (1.0 + SLACK) + SLACK
-        radius = math.sqrt(limit * (1.0 + SLACK))
-        norm = b * b + c * c
-        x0, x1 = tile_span(x, radius * math.sqrt(norm) / (a * c), tile_size, tiles_x)
-        y0, y1 = tile_span(y, radius / c, tile_size, tiles_y)
-        shape = (records.dtype.type(-a * b / norm), records.dtype.type(-b / a))
-        bound = splat(records.dtype.type(limit))
+        x0, x1 = tile_span(scratch[lane], scratch[2 * LANES + lane], tile_size, tiles_x)
+        y0, y1 = tile_span(scratch[LANES + lane], scratch[3 * LANES + lane], tile_size, tiles_y)
+        shape = (records.dtype.type(scratch[4 * LANES + lane]), records.dtype.type(scratch[5 * LANES + lane]))
+        bound = splat(records.dtype.type(scratch[6 * LANES + lane]))
         for row in range(y0, y1 + 1):
             for column in range(x0, x1 + 1):
                 mask = np.uint64(0)

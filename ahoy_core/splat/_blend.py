@@ -1,7 +1,8 @@
 """Front-to-back blending of a tile's Gaussians, one 4 x 4 block of pixels per vector (Kerbl et al. 2023, eq. 2-3).
 
 The state of a block is stored together (transmittance, alpha, then the channels), so a tile of 16 x 16 pixels and three
-channels lives in 5 KB. Alpha is summed on its own, because 1 - transmittance has no digits left where it is faint. A pixel is finished when its transmittance would fall to the stop; that is kept as its sign.
+channels lives in 5 KB. Alpha is summed on its own, because 1 - transmittance has no digits left where it is faint. A
+pixel is finished when its transmittance would fall to the stop; that is kept as its sign.
 All arithmetic is relative to the block's corner, so the image does not depend on tile size or number of threads.
 """
 
@@ -14,20 +15,9 @@ import numpy as np
 from ahoy_core.splat._binning import HEAD
 from ahoy_core.splat._channels import channel_blend, splat_channels
 from ahoy_core.splat._jit import kernel
-from ahoy_core.splat._simd import (
-    LANES,
-    bits,
-    exp2,
-    fma,
-    fnma,
-    load,
-    lowest_bit,
-    minimum,
-    prefetch,
-    select,
-    splat,
-    store,
-)
+from ahoy_core.splat._powers import exp2
+from ahoy_core.splat._simd import bits, fma, fnma, load, lowest_bit, maximum, minimum, prefetch, select, splat, store
+from ahoy_core.splat._vectors import LANES
 
 AHEAD = 6
 
@@ -43,41 +33,65 @@ def whiten(records: Any, slot: int, grid: Any, group: int, x: int, y: int, offse
 
 
 @kernel
-def start_tile(x: int, y: int, width: int, height: int, grid: Any, state: Any, stride: int, last: Any) -> Any:
+def block_corner(block: int, x: int, y: int, side: int) -> tuple[int, int]:
+    """First column and row of a block, in a tile of side x side blocks at (x, y)."""
+    return x + block % side * 4, y + block // side * 4
+
+
+@kernel
+def start_tile(x: int, y: int, width: int, height: int, side: int, stride: int, state: Any, last: Any) -> Any:
     """Reset a tile's state: transmittance 1 inside the image, 0 outside. Returns the bits of blocks inside."""
-    blocks = (grid.shape[0] - 32) // 2
     alive = np.uint64(0)
-    one, zero = state.dtype.type(1.0), state.dtype.type(0.0)
-    for block in range(blocks):
-        left, top = x + int(grid[32 + block]), y + int(grid[32 + blocks + block])
-        if left < width and top < height:
+    zero = splat(state.dtype.type(0.0))
+    none = splat(np.int32(-1))
+    for block in range(side * side):
+        left, top = block_corner(block, x, y, side)
+        base, columns, rows = block * stride, min(4, width - left), min(4, height - top)
+        for k in range(1, stride // LANES):
+            store(state, base + k * LANES, zero)
+        store(last, block * LANES, none)
+        store(state, base, zero + state.dtype.type(1.0) if columns == 4 and rows == 4 else zero)
+        if columns > 0 and rows > 0:
             alive |= np.uint64(1) << np.uint64(block)
-        for k in range(stride):
-            state[block * stride + k] = zero
-        for lane in range(LANES):
-            inside = left + lane % 4 < width and top + lane // 4 < height
-            state[block * stride + lane] = one if inside else zero
-            last[block * LANES + lane] = -1
+            if columns < 4 or rows < 4:
+                for row in range(rows):
+                    for column in range(columns):
+                        state[base + 4 * row + column] = 1.0
     return alive
 
 
 @kernel
-def write_tile(
-    x: int, y: int, width: int, height: int, grid: Any, state: Any, stride: int, background: Any, image: Any,
-    alphas: Any,
-) -> None:  # fmt: skip
-    """Copy a tile's blocks into the image [H,W,D], with the background behind them."""
-    blocks, channels = (grid.shape[0] - 32) // 2, image.shape[2]
-    for block in range(blocks):
-        left, top, base = x + int(grid[32 + block]), y + int(grid[32 + blocks + block]), block * stride
-        for lane in range(LANES):
-            column, row = left + lane % 4, top + lane // 4
-            if column >= width or row >= height:
-                continue
-            rest = abs(state[base + lane])
-            alphas[row, column, 0] = state[base + LANES + lane]
-            for k in range(channels):
-                image[row, column, k] = state[base + (k + 2) * LANES + lane] + rest * background[k]
+def finish_tile(
+    tile: int, side: int, background: Any, like: Any, state: Any, last: Any, rests: Any, lasts: Any
+) -> None:
+    """Put the background behind a tile's channels; keep transmittance and last rank if rests has rows."""
+    stride = (2 + len(like)) * LANES
+    behind = splat_channels(background, 0, like)
+    for block in range(side * side):
+        before = load(state, block * stride)
+        rest = maximum(before, -before)
+        channel_blend(behind, rest, state, block * stride + 2 * LANES)
+        if rests.shape[0] > 0:
+            place = tile * rests.shape[1] + block * LANES
+            store(rests, place, rest)
+            store(lasts, place, load(last, block * LANES))
+
+
+@kernel
+def write_tile(x: int, y: int, side: int, like: Any, state: Any, image: Any, alphas: Any) -> None:
+    """Copy a tile's blocks into the image [H,W,D] and the alphas [H,W,1]."""
+    height, width, channels = image.shape
+    stride = (2 + len(like)) * LANES
+    for block in range(side * side):
+        left, top = block_corner(block, x, y, side)
+        base = block * stride + LANES
+        for row in range(min(4, height - top)):
+            for column in range(min(4, width - left)):
+                lane = 4 * row + column
+                alphas[top + row, left + column, 0] = state[base + lane]
+                for k in range(len(like)):
+                    if k < channels:
+                        image[top + row, left + column, k] = state[base + (k + 1) * LANES + lane]
 
 
 @kernel
@@ -143,18 +157,13 @@ def blend_forward(
     for the backward pass; without rows they are not kept. state, offsets: scratch of this thread.
     """
     height, width = image.shape[0], image.shape[1]
-    tiles_x = (width + tile_size - 1) // tile_size
-    stride, blocks = (2 + len(like)) * LANES, (grid.shape[0] - 32) // 2
-    last = np.empty(blocks * LANES, np.int32)
+    tiles_x, side = (width + tile_size - 1) // tile_size, tile_size // 4
+    stride, last = (2 + len(like)) * LANES, np.empty(side * side * LANES, np.int32)
     for tile in range(part, len(starts) - 1, parts):
         x, y = tile % tiles_x * tile_size, tile // tiles_x * tile_size
-        alive = start_tile(x, y, width, height, grid, state, stride, last)
+        alive = start_tile(x, y, width, height, side, stride, state, last)
         blend_tile(
             starts[tile], starts[tile + 1], ids, masks, records, grid, x, y, alive, like, limits, state, last, offsets
         )
-        write_tile(x, y, width, height, grid, state, stride, background, image, alphas)
-        if rests.shape[0] > 0:
-            for block in range(rests.shape[1] // LANES):
-                for lane in range(LANES):
-                    rests[tile, block * LANES + lane] = abs(state[block * stride + lane])
-                    lasts[tile, block * LANES + lane] = last[block * LANES + lane]
+        finish_tile(tile, side, background, like, state, last, rests, lasts)
+        write_tile(x, y, side, like, state, image, alphas)

@@ -11,61 +11,60 @@ from typing import Any, Final
 import numpy as np
 
 from ahoy_core.splat._binning import HEAD
-from ahoy_core.splat._blend import AHEAD, whiten
+from ahoy_core.splat._blend import AHEAD, block_corner, whiten
 from ahoy_core.splat._channels import channel_dot, channel_weigh, splat_channels, zero_channels
 from ahoy_core.splat._jit import kernel
-from ahoy_core.splat._simd import (
-    LANES,
-    add_sums,
-    bits,
-    exp2,
-    fma,
-    fnma,
-    lane_sum,
-    load,
-    lowest_bit,
-    minimum,
-    prefetch,
-    select,
-    splat,
-    store,
-)
+from ahoy_core.splat._powers import exp2
+from ahoy_core.splat._reductions import add_sums, lane_max, lane_sum
+from ahoy_core.splat._simd import bits, fma, fnma, load, lowest_bit, minimum, prefetch, select, splat, store
+from ahoy_core.splat._vectors import LANES
 from ahoy_core.splat.constants import LN2
 
 MOMENTS: Final = 6
 
 
 @kernel
-def load_tile(
-    tile: int, x: int, y: int, grid: Any, background: Any, v_image: Any, v_alphas: Any, rests: Any, lasts: Any,
-    state: Any, stride: int, last: Any, deepest: Any, v_background: Any,
-) -> int:  # fmt: skip
-    """Fill a tile's state: transmittance, suffix sum, gradient of each channel. Returns the last rank of all.
-
-    The suffix sum starts with the gradient through the background, T (background . v_color - v_alpha).
-    """
+def load_tile(x: int, y: int, side: int, like: Any, v_image: Any, v_alphas: Any, state: Any) -> None:
+    """Gather the gradients of a tile's channels, and of alpha in place of the suffix sum; 0 outside the image."""
     height, width, channels = v_image.shape
-    blocks = (grid.shape[0] - 32) // 2
-    furthest = -1
-    for block in range(rests.shape[1] // LANES):
-        left, top, base = x + int(grid[32 + block]), y + int(grid[32 + blocks + block]), block * stride
-        deepest[block] = -1
-        for lane in range(LANES):
-            column, row, at = left + lane % 4, top + lane // 4, block * LANES + lane
-            inside = column < width and row < height
-            rest = rests[tile, at]
-            state[base + lane] = rest if inside else state.dtype.type(1.0)
-            last[at] = lasts[tile, at]
-            deepest[block] = max(deepest[block], last[at])
-            behind = -v_alphas[row, column, 0] if inside else state.dtype.type(0.0)
-            for k in range(channels):
-                value = v_image[row, column, k] if inside else state.dtype.type(0.0)
-                state[base + (2 + k) * LANES + lane] = value
-                behind += background[k] * value
-            state[base + LANES + lane] = rest * behind if inside else state.dtype.type(0.0)
+    stride, zero = (2 + len(like)) * LANES, splat(state.dtype.type(0.0))
+    for block in range(side * side):
+        left, top = block_corner(block, x, y, side)
+        base, columns, rows = block * stride + LANES, min(4, width - left), min(4, height - top)
+        if columns < 4 or rows < 4:
+            for k in range(1 + len(like)):
+                store(state, base + k * LANES, zero)
+        for row in range(rows):
+            for column in range(columns):
+                lane = 4 * row + column
+                state[base + lane] = v_alphas[top + row, left + column, 0]
+                for k in range(len(like)):
+                    if k < channels:
+                        state[base + (k + 1) * LANES + lane] = v_image[top + row, left + column, k]
+
+
+@kernel
+def start_suffix(
+    tile: int, side: int, background: Any, like: Any, rests: Any, lasts: Any, state: Any, last: Any, deepest: Any,
+    v_background: Any,
+) -> int:  # fmt: skip
+    """Load transmittances and ranks and start the suffix sums with what the background carries.
+
+    That is T (background . v_color - v_alpha). Returns the last rank of the tile.
+    """
+    stride, furthest = (2 + len(like)) * LANES, -1
+    behind = splat_channels(background, 0, like)
+    for block in range(side * side):
+        base, place = block * stride, tile * rests.shape[1] + block * LANES
+        rest, ranks = load(rests, place), load(lasts, place)
+        store(state, base, rest)
+        store(last, block * LANES, ranks)
+        carried = channel_dot(behind, state, base + 2 * LANES) - load(state, base + LANES)
+        store(state, base + LANES, rest * carried)
+        deepest[block] = lane_max(ranks)
         furthest = max(furthest, deepest[block])
         for k in range(len(v_background)):
-            v_background[k] += lane_sum(load(state, base) * load(state, base + (2 + k) * LANES))
+            v_background[k] += lane_sum(rest * load(state, base + (2 + k) * LANES))
     return furthest
 
 
@@ -124,7 +123,7 @@ def unblend_tile(
             h0, hu, hw = h0 + h, hu + h_u, hw + h_w
             huu, huw, hww = fma(h_u, u, huu), fma(h_u, w, huw), fma(h_w, w, hww)
         if any_hit:
-            add_sums(sums, slot * sums.shape[1], (h0, hu, hw, huu, huw, hww) + shades)
+            add_sums(sums, slot * sums.shape[1], (h0, hu, hw, huu, huw, hww) + shades)  # noqa: RUF005
 
 
 @kernel
@@ -134,44 +133,73 @@ def blend_backward(
     sums: Any, v_background: Any,
 ) -> None:  # fmt: skip
     """Add the moments of every parts-th tile to sums and the background's gradient to v_background [D] (float64)."""
-    width = v_image.shape[1]
-    tiles_x = (width + tile_size - 1) // tile_size
-    stride, blocks = (2 + len(like)) * LANES, (grid.shape[0] - 32) // 2
-    last, deepest = np.empty(blocks * LANES, np.int32), np.full(blocks, np.int32(-1))
-    for k in range(len(state)):
-        state[k] = 0
+    tiles_x, side = (v_image.shape[1] + tile_size - 1) // tile_size, tile_size // 4
+    last, deepest = np.empty(side * side * LANES, np.int32), np.full(max(LANES, side * side), np.int32(-1))
     for tile in range(part, len(starts) - 1, parts):
         x, y = tile % tiles_x * tile_size, tile // tiles_x * tile_size
-        furthest = load_tile(
-            tile, x, y, grid, background, v_image, v_alphas, rests, lasts, state, stride, last, deepest, v_background
-        )
+        load_tile(x, y, side, like, v_image, v_alphas, state)
+        furthest = start_suffix(tile, side, background, like, rests, lasts, state, last, deepest, v_background)
         unblend_tile(
             starts[tile], furthest, ids, masks, records, grid, x, y, like, limits, state, last, deepest, offsets, sums
         )
 
 
 @kernel
+def add_threads(slot: int, lane: int, sums: Any, v_row: Any, scratch: Any) -> None:
+    """Add up the threads' sums of one slot, in their order: moments to scratch, channels to v_row."""
+    for k in range(MOMENTS):
+        total = 0.0
+        for p in range(sums.shape[0]):
+            total += sums[p, slot, k]
+        scratch[k * LANES + lane] = total
+    for k in range(v_row.shape[0]):
+        total = 0.0
+        for p in range(sums.shape[0]):
+            total += sums[p, slot, MOMENTS + k]
+        v_row[k] += total
+
+
+@kernel
+def moments_to_gradients(scratch: Any) -> None:
+    """Columns of scratch: moments (6), factors (3), opacity become gradients of mean (2), factors and opacity."""
+    hu, hw = load(scratch, LANES), load(scratch, 2 * LANES)
+    huu, huw, hww = load(scratch, 3 * LANES), load(scratch, 4 * LANES), load(scratch, 5 * LANES)
+    a, b, c = load(scratch, 6 * LANES), load(scratch, 7 * LANES), load(scratch, 8 * LANES)
+    v_opacity = load(scratch, 0) / load(scratch, 9 * LANES)
+    inverse = -2.0 * LN2 / c
+    store(scratch, 0, 2.0 * LN2 * a * hu)
+    store(scratch, LANES, 2.0 * LN2 * (b * hu + c * hw))
+    store(scratch, 2 * LANES, (-2.0 * LN2 * huu - b * inverse * huw) / a)
+    store(scratch, 3 * LANES, inverse * huw)
+    store(scratch, 4 * LANES, inverse * hww)
+    store(scratch, 5 * LANES, v_opacity)
+
+
+@kernel
 def gather_gradients(
-    start: int, stop: int, slots: Any, records: Any, opacities: Any, sums: Any, v_means2d: Any, v_factors: Any,
+    start: int, stop: int, slots: Any, factors: Any, opacities: Any, sums: Any, v_means2d: Any, v_factors: Any,
     v_opacities: Any, v_features: Any,
 ) -> None:  # fmt: skip
-    """Moments of all threads [P, slots, 6 + D] -> gradients of rows [start, stop), summed in the order of threads."""
-    parts, channels = sums.shape[0], v_features.shape[1]
-    for i in range(start, stop):
-        slot = slots[i]
-        if slot < 0:
-            continue
-        m0, m1, m2, m3, m4, m5 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-        for p in range(parts):
-            m0, m1, m2 = m0 + sums[p, slot, 0], m1 + sums[p, slot, 1], m2 + sums[p, slot, 2]
-            m3, m4, m5 = m3 + sums[p, slot, 3], m4 + sums[p, slot, 4], m5 + sums[p, slot, 5]
-        for k in range(channels):
-            total = 0.0
-            for p in range(parts):
-                total += sums[p, slot, MOMENTS + k]
-            v_features[i, k] += total
-        a, b, c = float(records[slot, 4]), float(records[slot, 5]), float(records[slot, 6])
-        v_means2d[i, 0], v_means2d[i, 1] = 2.0 * LN2 * a * m1, 2.0 * LN2 * (b * m1 + c * m2)
-        v_factors[i, 0] = -2.0 * LN2 * (m3 - b / c * m4) / a
-        v_factors[i, 1], v_factors[i, 2] = -2.0 * LN2 * m4 / c, -2.0 * LN2 * m5 / c
-        v_opacities[i] = m0 / opacities[i]
+    """Moments of all threads [P, slots, 6 + D] -> gradients of rows [start, stop); 0 where not visible."""
+    scratch = np.ones(10 * LANES)
+    for i in range(start, stop, LANES):
+        count = min(LANES, stop - i)
+        for row in range(min(i + LANES, stop), min(i + 2 * LANES, stop)):
+            if slots[row] >= 0:
+                for p in range(sums.shape[0]):
+                    prefetch(sums, (p * sums.shape[1] + slots[row]) * sums.shape[2])
+                    prefetch(sums, (p * sums.shape[1] + slots[row] + 1) * sums.shape[2] - 1)
+        for lane in range(count):
+            if slots[i + lane] >= 0:
+                add_threads(slots[i + lane], lane, sums, v_features[i + lane], scratch)
+                for k in range(3):
+                    scratch[(6 + k) * LANES + lane] = factors[i + lane, k]
+                scratch[9 * LANES + lane] = opacities[i + lane]
+        moments_to_gradients(scratch)
+        for lane in range(count):
+            seen = slots[i + lane] >= 0
+            for k in range(2):
+                v_means2d[i + lane, k] = scratch[k * LANES + lane] if seen else 0.0
+            for k in range(3):
+                v_factors[i + lane, k] = scratch[(2 + k) * LANES + lane] if seen else 0.0
+            v_opacities[i + lane] = scratch[5 * LANES + lane] if seen else 0.0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,11 +37,12 @@ class View:
     antialiased: bool
 
 
-def pack_cameras(viewmats: NDArray[np.float64], Ks: NDArray[np.float64], view: View) -> NDArray[np.float64]:
-    """viewmats [C,4,4] world -> camera and Ks [C,3,3] pixels -> [C,SIZE]."""
+def pack_cameras(viewmats: NDArray[Any], Ks: NDArray[Any], view: View) -> NDArray[np.float64]:
+    """Flatten viewmats [C,4,4] world -> camera and Ks [C,3,3] pixels to [C,SIZE]."""
     packed = np.empty((len(viewmats), SIZE))
     packed[:, ROTATION:TRANSLATION] = viewmats[:, :3, :3].reshape(-1, 9)
     packed[:, TRANSLATION:FX] = viewmats[:, :3, 3]
+    Ks = Ks.astype(np.float64)
     fx, fy, cx, cy = Ks[:, 0, 0], Ks[:, 1, 1], Ks[:, 0, 2], Ks[:, 1, 2]
     packed[:, FX], packed[:, FY], packed[:, CX], packed[:, CY] = fx, fy, cx, cy
     packed[:, X_MIN] = -(cx + FRUSTUM_MARGIN * view.width) / fx

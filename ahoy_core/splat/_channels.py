@@ -9,19 +9,19 @@ from typing import Any
 
 from llvmlite import ir
 from numba.core import cgutils, types
-from numba.extending import intrinsic
 
-from ahoy_core.splat._simd import LANES, VecType, _broadcast, _call, _element_pointer, _suffix
+from ahoy_core.splat._jit import intrinsic
+from ahoy_core.splat._vectors import LANES, VecType, broadcast, call_llvm, element_pointer, suffix
 
 
-def _load(builder: Any, pointer: Any, offset: int, array_type: types.Array) -> Any:
+def _load(builder: Any, pointer: Any, offset: int, array_type: Any) -> Any:
     pointer = builder.gep(pointer, [ir.Constant(ir.IntType(64), offset)])
     kind = ir.VectorType(pointer.type.pointee, LANES)
     return builder.load(builder.bitcast(pointer, kind.as_pointer()), align=array_type.dtype.bitwidth // 8)
 
 
 def _fma(builder: Any, kind: VecType, a: Any, b: Any, c: Any) -> Any:
-    return _call(builder, f"llvm.fmuladd.{_suffix(kind)}", a.type, [a, b, c])
+    return call_llvm(builder, f"llvm.fmuladd.{suffix(kind)}", a.type, [a, b, c])
 
 
 @intrinsic
@@ -30,11 +30,11 @@ def splat_channels(typingctx: Any, array: Any, index: Any, like: Any) -> Any:
     kind = VecType(array.dtype)
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        pointer = _element_pointer(context, builder, sig.args[0], args[0], args[1])
+        pointer = element_pointer(context, builder, sig.args[0], args[0], args[1])
         parts = []
         for channel in range(sig.return_type.count):
             element = builder.gep(pointer, [ir.Constant(ir.IntType(64), channel)])
-            parts.append(_broadcast(builder, builder.load(element, align=array.dtype.bitwidth // 8)))
+            parts.append(broadcast(builder, builder.load(element, align=array.dtype.bitwidth // 8)))
         return context.make_tuple(builder, sig.return_type, parts)
 
     return types.UniTuple(kind, like.count)(array, types.intp, like), codegen
@@ -55,7 +55,7 @@ def channel_dot(typingctx: Any, colors: Any, array: Any, index: Any) -> Any:
     """Sum over channels of a colour times the stored plane of that channel."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        pointer = _element_pointer(context, builder, sig.args[1], args[1], args[2])
+        pointer = element_pointer(context, builder, sig.args[1], args[1], args[2])
         total = None
         for channel, color in enumerate(cgutils.unpack_tuple(builder, args[0])):
             plane = _load(builder, pointer, channel * LANES, sig.args[1])
@@ -70,7 +70,7 @@ def channel_weigh(typingctx: Any, sums: Any, weight: Any, array: Any, index: Any
     """Each channel's sum plus weight times the stored plane of that channel."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        pointer = _element_pointer(context, builder, sig.args[2], args[2], args[3])
+        pointer = element_pointer(context, builder, sig.args[2], args[2], args[3])
         parts = []
         for channel, total in enumerate(cgutils.unpack_tuple(builder, args[0])):
             plane = _load(builder, pointer, channel * LANES, sig.args[2])
@@ -85,7 +85,7 @@ def channel_blend(typingctx: Any, colors: Any, weight: Any, array: Any, index: A
     """Add weight times colour to the stored plane of every channel."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        pointer = _element_pointer(context, builder, sig.args[2], args[2], args[3])
+        pointer = element_pointer(context, builder, sig.args[2], args[2], args[3])
         align = sig.args[2].dtype.bitwidth // 8
         for channel, color in enumerate(cgutils.unpack_tuple(builder, args[0])):
             plane = _load(builder, pointer, channel * LANES, sig.args[2])

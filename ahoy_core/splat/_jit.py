@@ -4,15 +4,25 @@ from __future__ import annotations
 
 import functools
 import logging
+from collections.abc import Callable
 from typing import Any, Final
 
 import numba
 from numba.core import event
+from numba.extending import intrinsic as _intrinsic
 
 _LOGGER = logging.getLogger("ahoy_core.splat")
 
-kernel: Final = functools.partial(numba.njit, nogil=True, cache=True, error_model="numpy")
+kernel: Final[Callable[[Any], Any]] = functools.partial(numba.njit, nogil=True, cache=True, error_model="numpy")
 """Decorator of everything that runs in machine code. No fastmath flag: NaN rows are told apart by comparisons."""
+
+inlined: Final[Callable[[Any], Any]] = functools.partial(
+    numba.njit, nogil=True, cache=True, error_model="numpy", forceinline=True
+)
+"""Of helpers that hand vectors to each other: a call would push sixteen lanes through memory."""
+
+intrinsic: Final[Callable[[Any], Any]] = _intrinsic
+"""Decorator of what is written directly in LLVM's language."""
 
 
 class _Announcement(event.Listener):

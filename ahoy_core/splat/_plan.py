@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 from dataclasses import dataclass
 from typing import Any
@@ -34,6 +35,7 @@ class Tiling:
         """Rows of tiles."""
         return -(-self.height // self.tile_size)
 
+    @functools.lru_cache(maxsize=64)  # noqa: B019
     def grid(self, dtype: Any) -> Array:
         """Pixel of each lane in its block (x then y), then the first pixel centre of each block in its tile.
 
@@ -85,15 +87,16 @@ def intersection_bytes(tiling: Tiling) -> int:
 
 
 def make_plan(
-    tiling: Tiling, radii: Array, means2d: Array, residuals: Array, factors: Array, opacities: Array, features: Array,
-    order_keys: Array, log2_cutoff: float, budget: int, threads: int,
+    tiling: Tiling, projected: list[Array], features: Array, order_keys: Array, log2_cutoff: float, budget: int,
+    threads: int,
 ) -> Plan:  # fmt: skip
-    """Pack, sort and tile one camera's Gaussians (arrays [N,...]).
+    """Pack, sort and tile one camera's Gaussians: projected are radii, means2d, residuals, factors and opacities.
 
     Raises:
         MemoryError: If the intersections would take more than budget bytes; nothing of that size was allocated.
     """
     size, tx, ty = tiling.tile_size, tiling.tiles_x, tiling.tiles_y
+    radii, means2d = projected[:2]
     spans = split(len(radii), threads)
     homes = np.zeros((len(spans), tx * ty), np.int64)
     visible = run_parts(lambda p: binning.count_homes(*spans[p], radii, means2d, size, tx, ty, homes[p]), len(spans))
@@ -105,7 +108,7 @@ def make_plan(
     slots, keys = np.empty(len(radii), np.int32), np.empty(total)
     run_parts(
         lambda p: binning.pack_records(
-            *spans[p], first[p], radii, means2d, residuals, factors, opacities, features, order_keys, size, tx, ty,
+            *spans[p], first[p], *projected, features, order_keys, size, tx, ty,
             homes[p], records, owners, slots, keys, sequence,
         ),
         len(spans),
@@ -131,7 +134,7 @@ def _intersect(
         return binning.find_tiles(
             *spans[part], order, records, grid, log2_cutoff, tiling.tile_size, tiling.tiles_x, tiling.tiles_y, room,
             counts[part], per_slot, mask_like,
-        )  # type: ignore[no-any-return]  # fmt: skip
+        )  # fmt: skip
 
     found = run_parts(lambda p: find(p, allowed // parts), parts)
     total = sum(item[2] for item in found)

@@ -2,123 +2,147 @@
 
 from __future__ import annotations
 
-import math
-from typing import Any
+from typing import Any, Final
+
+import numpy as np
 
 from ahoy_core.splat import _camera as cam
-from ahoy_core.splat._jit import kernel
+from ahoy_core.splat._jit import inlined, kernel
+from ahoy_core.splat._powers import sqrt
 from ahoy_core.splat._project import (
-    Scalars,
+    INPUTS,
+    MEAN,
+    SHAPE,
+    Vecs,
+    column,
     covariance_of_full,
     covariance_of_half,
+    gather_inputs,
     half_covariance,
     jacobian,
     rotation,
     symmetric,
     to_camera,
+    unit_quaternion,
     world_rows,
 )
+from ahoy_core.splat._reductions import lane_sum
+from ahoy_core.splat._simd import load, maximum, minimum, select, splat, store
+from ahoy_core.splat._vectors import LANES
 from ahoy_core.splat.constants import KAPPA
 
+V_MEAN2D, V_DEPTH, V_CONIC, V_FACTOR, V_RHO, SEEN = 0, 2, 3, 6, 9, 10  # columns of the incoming gradients
+GRADIENTS: Final = 11
+RESULTS: Final = 10  # mean (3), then quaternion (4) and scales (3), or the symmetric covariance (6)
 
-@kernel
-def from_factors(a: float, xx: float, xy: float, yy: float, det: float, va: float, vb: float, vc: float) -> Scalars:
-    """Gradient of the blurred covariance (xx, xy, yy) from that of the factors a, b = -a xy / yy, c = sqrt(KAPPA / yy).
+
+@inlined
+def from_factors(xx: Any, xy: Any, yy: Any, det: Any, v: Any) -> Vecs:
+    """Gradient of the blurred covariance from that of a = sqrt(KAPPA yy / det), b = -a xy / yy, c = sqrt(KAPPA / yy).
 
     d det = yy dxx + xx dyy - 2 xy dxy is folded in, which leaves no difference of large numbers for needles.
     """
-    inner = va - vb * xy / yy
-    v_xx = -0.5 * inner * a * yy / det
-    v_xy = inner * a * xy / det - vb * a / yy
-    v_yy = -0.5 * inner * a * xy * xy / (yy * det) + vb * a * xy / (yy * yy) - 0.5 * vc * math.sqrt(KAPPA / yy) / yy
-    return v_xx, v_xy, v_yy
+    va, vb, vc = column(v, V_FACTOR), column(v, V_FACTOR + 1), column(v, V_FACTOR + 2)
+    inverse, slope = 1.0 / det, xy / yy
+    a, inverse_yy = sqrt(KAPPA * yy * inverse), 1.0 / yy
+    inner = (va - vb * slope) * a
+    v_xx = -0.5 * inner * yy * inverse
+    v_xy = inner * xy * inverse - vb * a * inverse_yy
+    v_yy = -0.5 * inner * xy * slope * inverse + vb * a * slope * inverse_yy
+    return v_xx, v_xy, v_yy - 0.5 * vc * sqrt(KAPPA * inverse_yy) * inverse_yy
 
 
-@kernel
-def from_conics(xx: float, xy: float, yy: float, det: float, va: float, vb: float, vc: float) -> Scalars:
+@inlined
+def from_conics(xx: Any, xy: Any, yy: Any, det: Any, v: Any) -> Vecs:
     """Gradient of the blurred covariance from that of its inverse (yy, -xy, xx) / det."""
-    v_det = -(yy * va - xy * vb + xx * vc) / (det * det)
-    return vc / det + v_det * yy, -vb / det - 2.0 * v_det * xy, va / det + v_det * xx
+    va, vb, vc = column(v, V_CONIC), column(v, V_CONIC + 1), column(v, V_CONIC + 2)
+    inverse = 1.0 / det
+    v_det = -(yy * va - xy * vb + xx * vc) * inverse * inverse
+    return vc * inverse + v_det * yy, -vb * inverse - 2.0 * v_det * xy, va * inverse + v_det * xx
 
 
-@kernel
-def from_compensation(blur: float, xx: float, xy: float, yy: float, sharp: float, det: float, v: float) -> Scalars:
+@inlined
+def from_compensation(blur: float, xx: Any, xy: Any, yy: Any, sharp: Any, det: Any, v: Any) -> Vecs:
     """Gradient of the covariance from that of sqrt(sharp / det); xx and yy include the blur.
 
     A visible Gaussian has sharp > 0: with a zero determinant its compensated opacity is 0 and it was culled.
     """
-    if not sharp > 0.0:
-        return 0.0, 0.0, 0.0
-    half = 0.5 * v * math.sqrt(sharp / det)
+    inverse, of_sharp = 1.0 / det, 1.0 / sharp
+    half = 0.5 * column(v, V_RHO) * sqrt(sharp * inverse)
     return (
-        half * ((yy - blur) / sharp - yy / det),
-        -2.0 * half * xy * (1.0 / sharp - 1.0 / det),
-        half * ((xx - blur) / sharp - xx / det),
+        half * ((yy - blur) * of_sharp - yy * inverse),
+        -2.0 * half * xy * (of_sharp - inverse),
+        half * ((xx - blur) * of_sharp - xx * inverse),
     )
 
 
-@kernel
-def to_mean(camera: Any, x: float, y: float, z: float, v_j: Scalars, v_mx: float, v_my: float) -> Scalars:
+@inlined
+def covariance_gradient(camera: Any, xx: Any, xy: Any, yy: Any, sharp: Any, v: Any, has: Any) -> Vecs:
+    """Sum of all that reaches the blurred covariance (xx, xy, yy); has says which gradients there are."""
+    blur = camera[cam.EPS2D]
+    det = sharp + blur * (xx + yy) + blur * blur
+    xx, yy = xx + blur, yy + blur
+    g0, g1, g2 = from_factors(xx, xy, yy, det, v)
+    if has[0]:
+        h0, h1, h2 = from_conics(xx, xy, yy, det, v)
+        g0, g1, g2 = g0 + h0, g1 + h1, g2 + h2
+    if has[1]:
+        h0, h1, h2 = from_compensation(blur, xx, xy, yy, sharp, det, v)
+        g0, g1, g2 = g0 + h0, g1 + h1, g2 + h2
+    return g0, g1, g2
+
+
+@inlined
+def to_mean(camera: Any, x: Any, y: Any, z: Any, v_j: Vecs, v_mx: Any, v_my: Any) -> Vecs:
     """Gradient of the camera-space mean from those of the Jacobian (j0, j2, k1, k2) and of the image mean."""
     fx, fy = camera[cam.FX], camera[cam.FY]
     if camera[cam.ORTHO] != 0.0:
-        return fx * v_mx, fy * v_my, 0.0
+        return fx * v_mx, fy * v_my, splat(0.0)
     rz = 1.0 / z
-    u = min(max(x * rz, camera[cam.X_MIN]), camera[cam.X_MAX])
-    v = min(max(y * rz, camera[cam.Y_MIN]), camera[cam.Y_MAX])
-    vx, vy = fx * rz * v_mx, fy * rz * v_my
-    vz = -(fx * x * v_mx + fy * y * v_my + fx * v_j[0] + fy * v_j[2] - fx * u * v_j[1] - fy * v * v_j[3]) * rz * rz
-    if u == x * rz:
-        vx -= fx * rz * rz * v_j[1]
-        vz += fx * u * rz * rz * v_j[1]
-    if v == y * rz:
-        vy -= fy * rz * rz * v_j[3]
-        vz += fy * v * rz * rz * v_j[3]
-    return vx, vy, vz
+    p, q, square = x * rz, y * rz, rz * rz
+    u = minimum(maximum(p, camera[cam.X_MIN]), camera[cam.X_MAX])
+    v = minimum(maximum(q, camera[cam.Y_MIN]), camera[cam.Y_MAX])
+    inner_x, inner_y = fx * square * v_j[1], fy * square * v_j[3]
+    free_x = select((p >= camera[cam.X_MIN]) & (p <= camera[cam.X_MAX]), inner_x, splat(0.0))
+    free_y = select((q >= camera[cam.Y_MIN]) & (q <= camera[cam.Y_MAX]), inner_y, splat(0.0))
+    vz = -(fx * x * v_mx + fy * y * v_my + fx * v_j[0] + fy * v_j[2]) * square
+    vz = vz + u * (inner_x + free_x) + v * (inner_y + free_y)
+    return fx * rz * v_mx - free_x, fy * rz * v_my - free_y, vz
 
 
-@kernel
-def to_quaternion(w: float, x: float, y: float, z: float, G: Scalars) -> Scalars:
-    """Gradient of an unnormalised quaternion from that of its rotation; a zero quaternion gets none."""
-    square = w * w + x * x + y * y + z * z
-    if not square > 0.0:
-        return 0.0, 0.0, 0.0, 0.0
-    inverse = 1.0 / math.sqrt(square)
-    w, x, y, z = w * inverse, x * inverse, y * inverse, z * inverse
+@inlined
+def to_quaternion(q: Vecs, G: Vecs) -> Vecs:
+    """Gradient of a quaternion of any length from that of its rotation; a zero quaternion gets none."""
+    w, x, y, z, inverse = q
     vw = 2.0 * (x * (G[7] - G[5]) + y * (G[2] - G[6]) + z * (G[3] - G[1]))
     vx = 2.0 * (-2.0 * x * (G[4] + G[8]) + y * (G[1] + G[3]) + z * (G[2] + G[6]) + w * (G[7] - G[5]))
     vy = 2.0 * (x * (G[1] + G[3]) - 2.0 * y * (G[0] + G[8]) + z * (G[5] + G[7]) + w * (G[2] - G[6]))
     vz = 2.0 * (x * (G[2] + G[6]) + y * (G[5] + G[7]) - 2.0 * z * (G[0] + G[4]) + w * (G[3] - G[1]))
     along = vw * w + vx * x + vy * y + vz * z
-    return (
-        (vw - w * along) * inverse,
-        (vx - x * along) * inverse,
-        (vy - y * along) * inverse,
-        (vz - z * along) * inverse,
-    )
+    vw, vx, vy, vz = vw - w * along, vx - x * along, vy - y * along, vz - z * along
+    return vw * inverse, vx * inverse, vy * inverse, vz * inverse
 
 
-@kernel
-def to_quats_and_scales(
-    rows: Scalars, B: Scalars, g: Scalars, quats: Any, scales: Any, i: int, v_quats: Any, v_scales: Any
-) -> Scalars:
-    """Add the gradients of quaternion and scales; returns that of the rows J R_cam."""
-    qw, qx, qy, qz = float(quats[i, 0]), float(quats[i, 1]), float(quats[i, 2]), float(quats[i, 3])
-    sx, sy, sz = float(scales[i, 0]), float(scales[i, 1]), float(scales[i, 2])
-    R = rotation(qw, qx, qy, qz)
+@inlined
+def to_quats_and_scales(rows: Vecs, B: Vecs, g: Vecs, q: Vecs, R: Vecs, scratch: Any, out: Any) -> Vecs:
+    """Write the gradients of quaternion and scales; returns that of the rows J R_cam."""
+    sx, sy, sz = column(scratch, SHAPE + 4), column(scratch, SHAPE + 5), column(scratch, SHAPE + 6)
     a, b, c, d, e, f = rows
-    u0, u1, u2 = 2.0 * g[0] * B[0] + g[1] * B[3], 2.0 * g[0] * B[1] + g[1] * B[4], 2.0 * g[0] * B[2] + g[1] * B[5]
-    v0, v1, v2 = 2.0 * g[2] * B[3] + g[1] * B[0], 2.0 * g[2] * B[4] + g[1] * B[1], 2.0 * g[2] * B[5] + g[1] * B[2]
+    twice0, twice2 = 2.0 * g[0], 2.0 * g[2]
+    u0, u1, u2 = twice0 * B[0] + g[1] * B[3], twice0 * B[1] + g[1] * B[4], twice0 * B[2] + g[1] * B[5]
+    v0, v1, v2 = twice2 * B[3] + g[1] * B[0], twice2 * B[4] + g[1] * B[1], twice2 * B[5] + g[1] * B[2]
     m0, m1, m2 = a * u0 + d * v0, a * u1 + d * v1, a * u2 + d * v2
     m3, m4, m5 = b * u0 + e * v0, b * u1 + e * v1, b * u2 + e * v2
     m6, m7, m8 = c * u0 + f * v0, c * u1 + f * v1, c * u2 + f * v2
-    v_scales[i, 0] += m0 * R[0] + m3 * R[3] + m6 * R[6]
-    v_scales[i, 1] += m1 * R[1] + m4 * R[4] + m7 * R[7]
-    v_scales[i, 2] += m2 * R[2] + m5 * R[5] + m8 * R[8]
+    store(out, 7 * LANES, m0 * R[0] + m3 * R[3] + m6 * R[6])
+    store(out, 8 * LANES, m1 * R[1] + m4 * R[4] + m7 * R[7])
+    store(out, 9 * LANES, m2 * R[2] + m5 * R[5] + m8 * R[8])
     G = (m0 * sx, m1 * sy, m2 * sz, m3 * sx, m4 * sy, m5 * sz, m6 * sx, m7 * sy, m8 * sz)
-    vq = to_quaternion(qw, qx, qy, qz, G)
-    for k in range(4):
-        v_quats[i, k] += vq[k]
+    vw, vx, vy, vz = to_quaternion(q, G)
+    store(out, 3 * LANES, vw)
+    store(out, 4 * LANES, vx)
+    store(out, 5 * LANES, vy)
+    store(out, 6 * LANES, vz)
     u0, u1, u2, v0, v1, v2 = u0 * sx, u1 * sy, u2 * sz, v0 * sx, v1 * sy, v2 * sz
     return (
         u0 * R[0] + u1 * R[1] + u2 * R[2], u0 * R[3] + u1 * R[4] + u2 * R[5], u0 * R[6] + u1 * R[7] + u2 * R[8],
@@ -126,23 +150,19 @@ def to_quats_and_scales(
     )  # fmt: skip
 
 
-@kernel
-def to_covars(rows: Scalars, S: Scalars, g: Scalars, i: int, v_covars: Any) -> Scalars:
-    """Add T^T G T to the gradient of the covariance (symmetric); returns that of the rows T = J R_cam, 2 G T S."""
+@inlined
+def to_covars(rows: Vecs, S: Vecs, g: Vecs, out: Any) -> Vecs:
+    """Write T^T G T, the gradient of the covariance; returns that of the rows T = J R_cam, 2 G T S."""
     a, b, c, d, e, f = rows
     half = 0.5 * g[1]
     p, q, r = g[0] * a + half * d, g[0] * b + half * e, g[0] * c + half * f
     s, t, w = half * a + g[2] * d, half * b + g[2] * e, half * c + g[2] * f
-    xy, xz, yz = a * q + d * t, a * r + d * w, b * r + e * w
-    v_covars[i, 0, 0] += a * p + d * s
-    v_covars[i, 1, 1] += b * q + e * t
-    v_covars[i, 2, 2] += c * r + f * w
-    v_covars[i, 0, 1] += xy
-    v_covars[i, 1, 0] += xy
-    v_covars[i, 0, 2] += xz
-    v_covars[i, 2, 0] += xz
-    v_covars[i, 1, 2] += yz
-    v_covars[i, 2, 1] += yz
+    store(out, 3 * LANES, a * p + d * s)
+    store(out, 4 * LANES, a * q + d * t)
+    store(out, 5 * LANES, a * r + d * w)
+    store(out, 6 * LANES, b * q + e * t)
+    store(out, 7 * LANES, b * r + e * w)
+    store(out, 8 * LANES, c * r + f * w)
     return (
         2.0 * (p * S[0] + q * S[1] + r * S[2]), 2.0 * (p * S[1] + q * S[3] + r * S[4]),
         2.0 * (p * S[2] + q * S[4] + r * S[5]), 2.0 * (s * S[0] + t * S[1] + w * S[2]),
@@ -150,77 +170,122 @@ def to_covars(rows: Scalars, S: Scalars, g: Scalars, i: int, v_covars: Any) -> S
     )  # fmt: skip
 
 
-@kernel
-def add_pose(pose: Any, v_rows: Scalars, j: Scalars, v_t: Scalars, x: float, y: float, z: float) -> None:
-    """Add the gradient of one Gaussian to that of [R | t], 12 values: through J R_cam and through R_cam mean + t."""
-    j0, j2, k1, k2 = j
-    world = (x, y, z)
-    for k in range(3):
-        pose[k] += j0 * v_rows[k] + v_t[0] * world[k]
-        pose[3 + k] += k1 * v_rows[3 + k] + v_t[1] * world[k]
-        pose[6 + k] += j2 * v_rows[k] + k2 * v_rows[3 + k] + v_t[2] * world[k]
-        pose[9 + k] += v_t[k]
+@inlined
+def add_pose(pose: Any, k: int, seen: Any, value: Any) -> None:
+    """Add the lanes that were seen to the k-th of the pose's sums."""
+    store(pose, k * LANES, load(pose, k * LANES) + select(seen, value, splat(0.0)))
+
+
+@inlined
+def shape_backward(camera: Any, full: bool, rows: Vecs, scratch: Any, v: Any, has: Any, out: Any) -> Vecs:
+    """Write the gradients of the shape's inputs; returns that of the rows J R_cam."""
+    if full:
+        S = symmetric(scratch)
+        xx, xy, yy, sharp = covariance_of_full(rows, S)
+        return to_covars(rows, S, covariance_gradient(camera, xx, xy, yy, sharp, v, has), out)
+    q = unit_quaternion(scratch)
+    R = rotation(q[0], q[1], q[2], q[3])
+    sx, sy, sz = column(scratch, SHAPE + 4), column(scratch, SHAPE + 5), column(scratch, SHAPE + 6)
+    B = half_covariance(rows, R, sx, sy, sz)
+    xx, xy, yy, sharp = covariance_of_half(B)
+    g = covariance_gradient(camera, xx, xy, yy, sharp, v, has)
+    return to_quats_and_scales(rows, B, g, q, R, scratch, out)
 
 
 @kernel
-def covariance_gradient(
-    camera: Any, i: int, xx: float, xy: float, yy: float, sharp: float, v_factors: Any, v_conics: Any, v_comps: Any
-) -> Scalars:
-    """Sum of all that reaches the blurred covariance (xx, xy, yy); arrays without rows carry no gradient."""
-    blur = camera[cam.EPS2D]
-    det = sharp + blur * (xx + yy) + blur * blur
-    xx, yy = xx + blur, yy + blur
-    g0, g1, g2 = 0.0, 0.0, 0.0
-    if v_factors.shape[0] > 0:
-        a = math.sqrt(KAPPA * yy / det)
-        va, vb, vc = float(v_factors[i, 0]), float(v_factors[i, 1]), float(v_factors[i, 2])
-        g0, g1, g2 = from_factors(a, xx, xy, yy, det, va, vb, vc)
-    if v_conics.shape[0] > 0:
-        va, vb, vc = float(v_conics[i, 0]), float(v_conics[i, 1]), float(v_conics[i, 2])
-        h0, h1, h2 = from_conics(xx, xy, yy, det, va, vb, vc)
-        g0, g1, g2 = g0 + h0, g1 + h1, g2 + h2
-    if v_comps.shape[0] > 0:
-        h0, h1, h2 = from_compensation(blur, xx, xy, yy, sharp, det, float(v_comps[i]))
-        g0, g1, g2 = g0 + h0, g1 + h1, g2 + h2
-    return g0, g1, g2
+def project_chunk_backward(camera: Any, full: bool, scratch: Any, v: Any, has: Any, out: Any, pose: Any) -> None:
+    """Gradients of sixteen gathered rows into columns of out; those of [R | t] are added to pose [12 x 16]."""
+    wx, wy, wz = column(scratch, MEAN), column(scratch, MEAN + 1), column(scratch, MEAN + 2)
+    seen = column(v, SEEN) > 0.0
+    x, y, z = to_camera(camera, wx, wy, wz)
+    j = jacobian(camera, x, y, z)
+    r = shape_backward(camera, full, world_rows(camera, j), scratch, v, has, out)
+    v_j = (
+        r[0] * camera[0] + r[1] * camera[1] + r[2] * camera[2], r[0] * camera[6] + r[1] * camera[7] + r[2] * camera[8],
+        r[3] * camera[3] + r[4] * camera[4] + r[5] * camera[5], r[3] * camera[6] + r[4] * camera[7] + r[5] * camera[8],
+    )  # fmt: skip
+    vx, vy, vz = to_mean(camera, x, y, z, v_j, column(v, V_MEAN2D), column(v, V_MEAN2D + 1))
+    vz = vz + column(v, V_DEPTH)
+    store(out, 0, camera[0] * vx + camera[3] * vy + camera[6] * vz)
+    store(out, LANES, camera[1] * vx + camera[4] * vy + camera[7] * vz)
+    store(out, 2 * LANES, camera[2] * vx + camera[5] * vy + camera[8] * vz)
+    for k, world in enumerate((wx, wy, wz)):
+        add_pose(pose, k, seen, j[0] * r[k] + vx * world)
+        add_pose(pose, 3 + k, seen, j[2] * r[3 + k] + vy * world)
+        add_pose(pose, 6 + k, seen, j[1] * r[k] + j[3] * r[3 + k] + vz * world)
+    add_pose(pose, 9, seen, vx)
+    add_pose(pose, 10, seen, vy)
+    add_pose(pose, 11, seen, vz)
+
+
+@kernel
+def gather_gradients_in(
+    i: int, count: int, radii: Any, v_means2d: Any, v_depths: Any, v_conics: Any, v_factors: Any, v_comps: Any, v: Any
+) -> bool:
+    """Columns of the incoming gradients of rows i, ...; arrays without rows count as zero. Whether any row was seen."""
+    seen = False
+    for lane in range(count):
+        row = i + lane
+        v[SEEN * LANES + lane] = 1.0 if radii[row, 0] > 0 else 0.0
+        seen = seen or radii[row, 0] > 0
+        if v_means2d.shape[0] > 0:
+            v[lane], v[LANES + lane] = v_means2d[row, 0], v_means2d[row, 1]
+        if v_depths.shape[0] > 0:
+            v[V_DEPTH * LANES + lane] = v_depths[row]
+        for k in range(3):
+            if v_conics.shape[0] > 0:
+                v[(V_CONIC + k) * LANES + lane] = v_conics[row, k]
+            if v_factors.shape[0] > 0:
+                v[(V_FACTOR + k) * LANES + lane] = v_factors[row, k]
+        if v_comps.shape[0] > 0:
+            v[V_RHO * LANES + lane] = v_comps[row]
+    for lane in range(count, LANES):
+        v[SEEN * LANES + lane] = 0.0
+    return seen
+
+
+@kernel
+def add_rows(
+    i: int, count: int, full: bool, v: Any, out: Any, v_means: Any, v_quats: Any, v_scales: Any, v_covars: Any
+) -> None:
+    """Add columns of out to the rows that were seen."""
+    for lane in range(count):
+        row = i + lane
+        if v[SEEN * LANES + lane] == 0.0:
+            continue
+        for k in range(3):
+            v_means[row, k] += out[k * LANES + lane]
+        if full:
+            at = 3
+            for k in range(3):
+                for m in range(k, 3):
+                    v_covars[row, k, m] += out[at * LANES + lane]
+                    if m > k:
+                        v_covars[row, m, k] += out[at * LANES + lane]
+                    at += 1
+        else:
+            for k in range(4):
+                v_quats[row, k] += out[(3 + k) * LANES + lane]
+            for k in range(3):
+                v_scales[row, k] += out[(7 + k) * LANES + lane]
 
 
 @kernel
 def project_backward(
-    start: int, stop: int, camera: Any, means: Any, quats: Any, scales: Any, covars: Any, radii: Any,
+    start: int, stop: int, camera: Any, means: Any, quats: Any, scales: Any, covars: Any, opacities: Any, radii: Any,
     v_means2d: Any, v_depths: Any, v_conics: Any, v_factors: Any, v_comps: Any,
     v_means: Any, v_quats: Any, v_scales: Any, v_covars: Any, pose: Any,
 ) -> None:  # fmt: skip
     """Add one camera's gradients of rows [start, stop) to the v_ arrays and to pose [12]; unseen rows are skipped."""
-    for i in range(start, stop):
-        if radii[i, 0] <= 0:
+    scratch, v, out = np.zeros(INPUTS * LANES), np.zeros(GRADIENTS * LANES), np.empty(RESULTS * LANES)
+    sums, full = np.zeros(12 * LANES), covars.shape[0] > 0
+    has = (v_conics.shape[0] > 0, v_comps.shape[0] > 0)
+    for i in range(start, stop, LANES):
+        count = min(LANES, stop - i)
+        if not gather_gradients_in(i, count, radii, v_means2d, v_depths, v_conics, v_factors, v_comps, v):
             continue
-        wx, wy, wz = float(means[i, 0]), float(means[i, 1]), float(means[i, 2])
-        x, y, z = to_camera(camera, wx, wy, wz)
-        j = jacobian(camera, x, y, z)
-        rows = world_rows(camera, j[0], j[1], j[2], j[3])
-        if covars.shape[0] > 0:
-            S = symmetric(covars, i)
-            xx, xy, yy, sharp = covariance_of_full(rows, S)
-            g = covariance_gradient(camera, i, xx, xy, yy, sharp, v_factors, v_conics, v_comps)
-            v_rows = to_covars(rows, S, g, i, v_covars)
-        else:
-            R = rotation(float(quats[i, 0]), float(quats[i, 1]), float(quats[i, 2]), float(quats[i, 3]))
-            B = half_covariance(rows, R, float(scales[i, 0]), float(scales[i, 1]), float(scales[i, 2]))
-            xx, xy, yy, sharp = covariance_of_half(B)
-            g = covariance_gradient(camera, i, xx, xy, yy, sharp, v_factors, v_conics, v_comps)
-            v_rows = to_quats_and_scales(rows, B, g, quats, scales, i, v_quats, v_scales)
-        v_j = (
-            v_rows[0] * camera[0] + v_rows[1] * camera[1] + v_rows[2] * camera[2],
-            v_rows[0] * camera[6] + v_rows[1] * camera[7] + v_rows[2] * camera[8],
-            v_rows[3] * camera[3] + v_rows[4] * camera[4] + v_rows[5] * camera[5],
-            v_rows[3] * camera[6] + v_rows[4] * camera[7] + v_rows[5] * camera[8],
-        )
-        v_mx = float(v_means2d[i, 0]) if v_means2d.shape[0] > 0 else 0.0
-        v_my = float(v_means2d[i, 1]) if v_means2d.shape[0] > 0 else 0.0
-        vx, vy, vz = to_mean(camera, x, y, z, v_j, v_mx, v_my)
-        if v_depths.shape[0] > 0:
-            vz += float(v_depths[i])
-        for k in range(3):
-            v_means[i, k] += camera[k] * vx + camera[3 + k] * vy + camera[6 + k] * vz
-        add_pose(pose, v_rows, j, (vx, vy, vz), wx, wy, wz)
+        gather_inputs(i, count, means, quats, scales, covars, opacities, scratch)
+        project_chunk_backward(camera, full, scratch, v, has, out, sums)
+        add_rows(i, count, full, v, out, v_means, v_quats, v_scales, v_covars)
+    for k in range(12):
+        pose[k] += lane_sum(load(sums, k * LANES))

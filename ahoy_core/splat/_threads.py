@@ -10,7 +10,7 @@ import os
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 
@@ -65,3 +65,8 @@ def split(count: int, threads: int, least: int = 1024) -> list[tuple[int, int]]:
     """Contiguous ranges that cover [0, count), one per thread, none much shorter than `least`."""
     parts = max(1, min(threads, count // least))
     return [(count * p // parts, count * (p + 1) // parts) for p in range(parts)]
+
+
+def run_spans(function: Callable[..., T], spans: list[tuple[int, int]], *args: Any, each: Any = ()) -> list[T]:
+    """Results of function(start, stop, *args) for every span; with `each`, that span's own last argument is added."""
+    return run_parts(lambda p: function(*spans[p], *args, *each[p : p + 1]), len(spans))

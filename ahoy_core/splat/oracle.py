@@ -12,7 +12,12 @@ from typing import Any, Final, Literal, NamedTuple
 import torch
 from torch import Tensor
 
-GSPLAT: Final = {"alpha_cutoff": 1 / 255, "alpha_max": 0.999, "transmittance_stop": 1e-4, "frustum_clamp": True}
+GSPLAT: Final[dict[str, Any]] = {
+    "alpha_cutoff": 1 / 255,
+    "alpha_max": 0.999,
+    "transmittance_stop": 1e-4,
+    "frustum_clamp": True,
+}
 """The shortcuts of gsplat (and of our kernels), to pass to `render` as keyword arguments."""
 
 MAX_PAIRS: Final = 1 << 22

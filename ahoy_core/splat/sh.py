@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from ahoy_core.splat._jit import kernel
-from ahoy_core.splat._threads import run_parts, split
+from ahoy_core.splat._threads import run_spans, split
 
 C0 = 0.28209479177387814
 C1 = 0.4886025119029199
@@ -82,7 +82,7 @@ def _sh_forward(
 @kernel
 def _sh_backward(
     start: int, stop: int, terms: int, means: Any, center: Any, coefficients: Any, radii: Any, colors: Any,
-    v_colors: Any, v_means: Any, v_center: Any, v_coefficients: Any,
+    v_colors: Any, v_means: Any, v_coefficients: Any, v_center: Any,
 ) -> None:  # fmt: skip
     """Add the gradients of the visible rows; a channel clamped to 0 carries none."""
     g = np.zeros(16)
@@ -113,17 +113,11 @@ class _SphericalHarmonics(torch.autograd.Function):
         ctx: Any, means: Tensor, centers: Tensor, coefficients: Tensor, radii: Tensor, degree: int, threads: int
     ) -> Tensor:
         cameras, count = radii.shape[:2]
-        colors = torch.empty((cameras, count, 3), dtype=coefficients.dtype)
+        colors = coefficients.new_empty(cameras, count, 3)
         terms, spans = (degree + 1) ** 2, split(count, threads)
-        arrays = [t.detach().numpy() for t in (means, centers, radii, colors)]
+        x, middle, own, seen, out = (t.detach().numpy() for t in (means, centers, coefficients, radii, colors))
         for c in range(cameras):
-            own = (coefficients if coefficients.dim() == 3 else coefficients[c]).detach().numpy()
-            run_parts(
-                lambda p, c=c, own=own: _sh_forward(
-                    *spans[p], terms, arrays[0], arrays[1][c], own, arrays[2][c], arrays[3][c]
-                ),
-                len(spans),
-            )
+            run_spans(_sh_forward, spans, terms, x, middle[c], own if own.ndim == 3 else own[c], seen[c], out[c])
         ctx.save_for_backward(means, centers, coefficients, radii, colors)
         ctx.terms, ctx.spans = terms, spans
         return colors
@@ -131,20 +125,15 @@ class _SphericalHarmonics(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, v_colors: Tensor) -> tuple[Any, ...]:
-        means, centers, coefficients, radii, colors = ctx.saved_tensors
+        means, _, coefficients, _, _ = ctx.saved_tensors
         v_means, v_coefficients = torch.zeros_like(means), torch.zeros_like(coefficients)
-        v_centers = np.zeros((len(ctx.spans), *centers.shape))
-        x, camera, r, y, v, vx = (
-            t.detach().numpy() for t in (means, centers, radii, colors, v_colors.contiguous(), v_means)
-        )
-        for c in range(len(centers)):
-            own, v_own = ((t if t.dim() == 3 else t[c]).detach().numpy() for t in (coefficients, v_coefficients))
-            run_parts(
-                lambda p, c=c, own=own, v_own=v_own: _sh_backward(
-                    *ctx.spans[p], ctx.terms, x, camera[c], own, r[c], y[c], v[c], vx, v_centers[p, c], v_own
-                ),
-                len(ctx.spans),
-            )
+        x, middle, own, seen, out = (t.detach().numpy() for t in ctx.saved_tensors)
+        v, vx, v_own = (t.detach().numpy() for t in (v_colors.contiguous(), v_means, v_coefficients))
+        v_centers = np.zeros((len(ctx.spans), *middle.shape))
+        for c in range(len(middle)):
+            shared = [a if a.ndim == 3 else a[c] for a in (own, v_own)]
+            arrays = (x, middle[c], shared[0], seen[c], out[c], v[c], vx, shared[1])
+            run_spans(_sh_backward, ctx.spans, ctx.terms, *arrays, each=v_centers[:, c])
         return v_means, torch.from_numpy(v_centers.sum(0)), v_coefficients, None, None, None
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any, Final
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -123,15 +124,14 @@ def check_tensors(tensors: dict[str, Tensor | None], means_name: str = "means") 
 
 def check_cameras(viewmats: Tensor, Ks: Tensor) -> None:
     """Raise ValueError unless poses are finite affine maps and intrinsics invertible without skew."""
-    views, K = viewmats.detach().double().cpu(), Ks.detach().double().cpu()
-    if not views.isfinite().all():
+    views, K = (t.detach().cpu().numpy() for t in (viewmats, Ks))
+    if not np.isfinite(views).all():
         raise ValueError("viewmats: expected finite world-to-camera matrices, got NaN or infinity; check the pose")
-    if not torch.allclose(views[:, 3], torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64), atol=1e-5):
+    if (np.abs(views[:, 3] - (0, 0, 0, 1)) > 1e-5).any():
         raise ValueError(f"viewmats: expected the last row 0 0 0 1, got {views[:, 3].tolist()}; is it transposed?")
-    if not K.isfinite().all() or not (K[:, 0, 0] > 0).all() or not (K[:, 1, 1] > 0).all():
+    if not np.isfinite(K).all() or not (K[:, (0, 1), (0, 1)] > 0).all():
         raise ValueError(f"Ks: expected finite values with fx, fy > 0, got {K.tolist()}; K must be invertible")
-    fixed = K[:, [0, 1, 2, 2, 2], [1, 0, 0, 1, 2]]
-    if not torch.equal(fixed, torch.tensor([0.0, 0, 0, 0, 1]).double().expand_as(fixed)):
+    if (K[:, (0, 1, 2, 2, 2), (1, 0, 0, 1, 2)] != (0, 0, 0, 0, 1)).any():
         raise ValueError(f"Ks: expected [[fx,0,cx],[0,fy,cy],[0,0,1]], got {K.tolist()}; skew is not supported")
 
 

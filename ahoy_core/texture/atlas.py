@@ -7,11 +7,12 @@ leaves no holes between pixels when the atlas is finer than the frame.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from ahoy_core.texture.align import best_shift
+from ahoy_core.texture.consensus import Consensus
 from ahoy_core.texture.rays import BoolArray, FloatArray, IntArray, to_pixels, view_cosines
 from ahoy_core.texture.surface import SeenFrame, Surface
 from ahoy_core.texture.texels import TexelMap, sample_image
@@ -38,6 +39,15 @@ class ObservedAtlas:
     source_frame: IntArray
 
 
+class Reading(NamedTuple):
+    """K texels that a frame shows: numbers, rgb [K,3] uint8, coverage [K] in (0,1] and margin [K] (see `SeenFrame`)."""
+
+    texel: IntArray
+    rgb: IntArray
+    coverage: FloatArray
+    margin: FloatArray
+
+
 class AtlasAccumulator:
     """Collects texel colours over frames.
 
@@ -48,15 +58,25 @@ class AtlasAccumulator:
             the frame with the best view of it does, by angle, mask alpha, distance to the nearest boundary and
             confidence.
         grazing_cos: smallest trusted cosine between normal and view, as given to `look`.
+        consensus: what most frames show; colours that contradict it are not written. None: everything is written.
     """
 
-    def __init__(self, surface: Surface, texels: TexelMap, mode: WriteMode = "first", grazing_cos: float = 0.3) -> None:
+    def __init__(
+        self,
+        surface: Surface,
+        texels: TexelMap,
+        mode: WriteMode = "first",
+        grazing_cos: float = 0.3,
+        consensus: Consensus | None = None,
+    ) -> None:
         self.surface, self.texels, self.mode, self.grazing_cos = surface, texels, mode, grazing_cos
+        self.consensus = consensus
         count = len(texels.face)
         self._rgb = np.zeros((count, 3), dtype=np.uint8)
         self._coverage = np.zeros(count, dtype=np.float32)
         self._source = np.full(count, -1, dtype=np.int32)
         self._score = np.zeros(count, dtype=np.float32)
+        self._everything = np.ones(count, dtype=bool)
 
     def add(
         self,
@@ -79,33 +99,43 @@ class AtlasAccumulator:
         """
         trust = self._texel_confidence(confidence)
         pending = (self._source < 0) if self.mode == "first" else np.ones(len(self._source), dtype=bool)
-        texel, pixels, cosine = self._candidates(seen, np.flatnonzero(pending & (trust >= min_confidence)))
+        texel, rgb, coverage, margin = self.read(image, visible, seen, pending & (trust >= min_confidence))
+        score = coverage * np.minimum(margin / SAFE_MARGIN, 1) * trust[texel]
+        better = (self.mode == "first") | (score > self._score[texel])
+        if self.consensus is not None:
+            better &= self.consensus.agrees(texel, rgb)
+        texel = texel[better]
+        self._rgb[texel], self._coverage[texel] = rgb[better], coverage[better]
+        self._source[texel], self._score[texel] = number, score[better]
+        return len(texel)
+
+    def read(self, image: IntArray, visible: IntArray, seen: SeenFrame, wanted: BoolArray | None = None) -> Reading:
+        """What a frame shows of the wanted texels [N] bool (None: of all); arguments as in `add`."""
+        texel, pixels, cosine = self._candidates(seen, np.flatnonzero(self._everything if wanted is None else wanted))
         # Only pixels inside the boundary give colour: at 30 pixels a person, bilinear lookups else take half of it
         # from the background.
         weight = np.where(seen.margin > 0, visible, 0).astype(np.float32)
         alpha = sample_image(weight, pixels) / 255
-        cell = _cells(pixels)
-        score = cosine * alpha * np.minimum(seen.margin[cell] / SAFE_MARGIN, 1) * trust[texel]
-        better = (alpha > 0) & ((self.mode == "first") | (score > self._score[texel]))
-        texel = texel[better]
-        colour = sample_image(image * weight[..., None], pixels[better]) / (255 * alpha[better, None])
-        self._rgb[texel] = np.clip(np.rint(colour), 0, 255).astype(np.uint8)
-        self._coverage[texel] = np.clip(cosine * alpha, 0, 1)[better]
-        self._source[texel] = number
-        self._score[texel] = score[better]
-        return len(texel)
+        found = alpha > 0
+        texel, pixels, cosine, alpha = texel[found], pixels[found], cosine[found], alpha[found]
+        colour = sample_image(image * weight[..., None], pixels) / (255 * alpha[:, None])
+        rgb = np.clip(np.rint(colour), 0, 255).astype(np.uint8)
+        return Reading(texel, rgb, np.clip(cosine * alpha, 0, 1), seen.margin[_cells(pixels)])
 
     def shift(self, image: IntArray, seen: SeenFrame, reach: float) -> tuple[float, float]:
-        """How far (x, y in pixels) a frame lies beside what was written before; (0, 0) where that can't be told.
+        """How far (x, y in pixels) a frame lies beside the consensus, or what was written; (0, 0) where none can tell.
 
         Args:
             image: [H,W,3] uint8 sRGB.
             seen: this frame, looked at.
             reach: largest shift along each axis, pixels.
         """
-        written = np.flatnonzero(self._source >= 0)
+        known, rgb = self._source >= 0, self._rgb
+        if self.consensus is not None:
+            known, rgb = self.consensus.votes > 0, self.consensus.rgb
+        written = np.flatnonzero(known)
         texel, pixels, _ = self._candidates(seen, written[:: 1 + len(written) // LOOKED_UP])
-        return best_shift(image, pixels, self._rgb[texel].astype(np.float32), reach)
+        return best_shift(image, pixels, rgb[texel].astype(np.float32), reach)
 
     def _texel_confidence(self, confidence: FloatArray | float) -> FloatArray:
         if np.ndim(confidence) == 0:

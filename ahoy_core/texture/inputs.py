@@ -20,6 +20,8 @@ class TextureConfig(BaseModel):
     `ahoy_core.texture.surface.look`. min_frame_confidence,
     min_joint_confidence: frames and body parts fitted worse than this write nothing. align_px: largest shift along
     each axis, in pixels of a body 200 pixels tall, by which a frame is moved to agree with what is written (0: off).
+    outlier_levels: colours further (of 255, in any channel) from what most frames show of a texel are not written (0:
+    all are).
     symmetry: fill from the other side of the body. canonical_height, canonical_width: pixels of the canonical views.
     supersample: rays a pixel and axis in them.
     """
@@ -34,6 +36,7 @@ class TextureConfig(BaseModel):
     min_frame_confidence: float = Field(0.3, ge=0, le=1)
     min_joint_confidence: float = Field(0.0, ge=0, le=1)
     align_px: float = Field(4.0, ge=0, le=64)
+    outlier_levels: float = Field(50.0, ge=0, le=255)
     symmetry: bool = True
     canonical_height: int = Field(512, ge=16, le=4096)
     canonical_width: int = Field(384, ge=16, le=4096)

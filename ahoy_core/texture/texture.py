@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,18 +12,14 @@ import torch
 from ahoy_core.body.canonical import canonical_pose
 from ahoy_core.body.model import BodyModel
 from ahoy_core.body.packaged import PackagedBody
-from ahoy_core.texture.atlas import AtlasAccumulator, ObservedAtlas
+from ahoy_core.texture.accumulate import Clip, Log, Progress, accumulate
+from ahoy_core.texture.atlas import ObservedAtlas
 from ahoy_core.texture.canonical import canonical_views
 from ahoy_core.texture.fill import FilledAtlas, fill_atlas
 from ahoy_core.texture.inputs import TextureConfig, check_inputs, choose_frames
 from ahoy_core.texture.rays import BoolArray, FloatArray, IntArray
-from ahoy_core.texture.surface import REFERENCE_HEIGHT, Surface, height_in_pixels, look, trust
+from ahoy_core.texture.surface import Surface
 from ahoy_core.texture.texels import TexelMap, texel_map
-
-Progress = Callable[[int, int], None]
-# Bodies posed in one call: enough to fill torch's vector units, few enough that vertices of long videos are never
-# held together.
-POSED_TOGETHER = 16
 
 
 @dataclass(frozen=True)
@@ -59,14 +55,6 @@ class Texture:
         return {**arrays, "coverage": self.view_coverage}
 
 
-@dataclass(frozen=True)
-class _Log:
-    """By frame number: texels written, and the shift (x, y in pixels) found before writing."""
-
-    written: dict[int, int]
-    shifts: dict[int, tuple[float, float]]
-
-
 def build_texture(
     frames: IntArray,
     visible: IntArray,
@@ -85,7 +73,7 @@ def build_texture(
             joint_confidence [T,J], frame_confidence [T], used [T], viewmat [4,4], K [3,3].
         body: the body model that was fitted.
         config: knobs.
-        progress: called with frames done and frames in all.
+        progress: called with frames done and frames in all, of both passes.
         canonical: [V,3] the fitted shape in the canonical pose theta_*; `canonical_vertices` of the packaged body by
             default.
 
@@ -96,8 +84,10 @@ def build_texture(
     surface = Surface.of(body)
     texels = texel_map(surface, config.atlas_size)
     chosen, rejected = choose_frames(fit["used"], fit["frame_confidence"], config)
-    observed, log = _accumulate(frames, visible, fit, body, surface, texels, chosen, config, progress)
     vertices = canonical_vertices(body, fit["betas"]) if canonical is None else canonical
+    points = texels.points(vertices, surface.faces)
+    clip = Clip(frames, visible, fit, body, surface, config)
+    observed, log = accumulate(clip, texels, points, chosen, progress)
     filled = fill_atlas(observed, surface, texels, vertices, config.symmetry)
     rendered = canonical_views(
         surface,
@@ -143,67 +133,6 @@ def canonical_vertices(body: BodyModel, betas: FloatArray) -> FloatArray:
     return vertices
 
 
-def _accumulate(
-    frames: IntArray,
-    visible: IntArray,
-    fit: Mapping[str, np.ndarray],
-    body: BodyModel,
-    surface: Surface,
-    texels: TexelMap,
-    chosen: list[int],
-    config: TextureConfig,
-    progress: Progress | None,
-) -> tuple[ObservedAtlas, _Log]:
-    """The observed atlas, and what happened on the way."""
-    atlas = AtlasAccumulator(surface, texels, config.mode, config.grazing_cos)
-    weights = body.lbs_weights.cpu().numpy()
-    log = _Log({}, {})
-    for done, (t, vertices) in enumerate(_posed(body, fit, chosen), start=1):
-        if not np.isfinite(vertices).all():
-            log.written[t] = 0
-            continue
-        seen = look(
-            surface,
-            vertices,
-            fit["viewmat"],
-            fit["K"],
-            visible[t],
-            grazing_cos=config.grazing_cos,
-            boundary_px=config.boundary_px,
-        )
-        shift = atlas.shift(frames[t], seen, config.align_px * height_in_pixels(seen.hits) / REFERENCE_HEIGHT)
-        if shift != (0.0, 0.0):
-            K = _shifted(fit["K"], shift)
-            seen = trust(surface, seen.caster, K, visible[t], config.grazing_cos, config.boundary_px)
-        confidence = fit["frame_confidence"][t] * (weights @ fit["joint_confidence"][t])
-        floor = config.min_joint_confidence * float(fit["frame_confidence"][t])
-        log.shifts[t] = shift
-        log.written[t] = atlas.add(t, frames[t], visible[t], seen, confidence, floor)
-        if progress is not None:
-            progress(done, len(chosen))
-    return atlas.result(), log
-
-
-def _shifted(K: FloatArray, shift: tuple[float, float]) -> FloatArray:
-    moved = np.array(K, dtype=np.float64)
-    moved[:2, 2] += shift
-    return moved
-
-
-def _posed(body: BodyModel, fit: Mapping[str, np.ndarray], chosen: list[int]) -> Iterator[tuple[int, FloatArray]]:
-    """Frame numbers and posed vertices [V,3], a few frames posed at a time."""
-    like = body.lbs_weights
-    betas = torch.as_tensor(fit["betas"]).to(like)
-    for start in range(0, len(chosen), POSED_TOGETHER):
-        numbers = chosen[start : start + POSED_TOGETHER]
-        pose, transl, expression = (
-            torch.as_tensor(fit[name][numbers]).to(like) for name in ("pose", "transl", "expression")
-        )
-        with torch.no_grad():
-            output = body(pose, betas.expand(len(numbers), -1), transl, expression)
-        yield from zip(numbers, output.vertices.cpu().numpy(), strict=True)
-
-
 def _notes(
     observed: ObservedAtlas,
     filled: FilledAtlas,
@@ -212,7 +141,7 @@ def _notes(
     vertices: FloatArray,
     chosen: list[int],
     rejected: dict[str, list[int]],
-    log: _Log,
+    log: Log,
     config: TextureConfig,
 ) -> dict[str, Any]:
     """What texture.json says."""

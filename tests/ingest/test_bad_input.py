@@ -163,6 +163,20 @@ def test_damaged_frame_is_left_out_and_the_others_keep_their_numbers(tmp_path: P
     assert any("damaged" in note for note in result.notes) and any("missing" in note for note in result.notes)
 
 
+def test_half_blanked_frame_is_left_out_and_the_next_key_frame_is_whole_again(tmp_path: Path) -> None:
+    path = encode(tmp_path / "clip.mp4", moving(30, 96, 128), options={"crf": "4", "g": "15", "bf": "0"})
+    whole = ingest(path)
+    data = bytearray(path.read_bytes())
+    with av.open(str(path)) as container:
+        packet = next(p for i, p in enumerate(container.demux(video=0)) if i == 10)
+        half = packet.size // 2
+        data[packet.pos + half : packet.pos + packet.size] = bytes(packet.size - half)
+    path.write_bytes(data)
+    result = ingest(path)
+    assert result.index.tolist() == [i for i in range(30) if i != 10]
+    assert np.array_equal(result.frames[14:], whole.frames[15:])
+
+
 def test_range_in_which_nothing_decodes_is_an_error(tmp_path: Path) -> None:
     path = encode(tmp_path / "png.mov", moving(8), codec="png", pix_fmt="rgb24")
     data = bytearray(path.read_bytes())

@@ -17,6 +17,7 @@ import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 
 from tests.mutants.catalogue import MUTANTS, Mutant
@@ -114,7 +115,7 @@ def main() -> int:
         parser.error(f"expected names of the catalogue, got {sorted(unknown)}: see tests/mutants/catalogue.py")
     problems = 0
     with ThreadPoolExecutor(arguments.jobs) as pool:
-        for outcome in [baseline(chosen), *pool.map(judge, chosen)]:
+        for outcome in chain([baseline(chosen)], pool.map(judge, chosen)):
             print(f"{'PROBLEM' if outcome.problem else 'caught':8} {outcome.name}  {outcome.problem}", flush=True)
             problems += bool(outcome.problem)
     print(f"{len(chosen)} mutants, {problems} problems")

@@ -18,6 +18,7 @@ PER_GAUSSIAN = ("means", "quats", "scales", "covars", "opacities", "colors")
 def check_isolated(scene: Scene) -> None:
     others = all_but(N, ROW)
     broken, clean = run(rasterization, scene), run(rasterization, select(scene, others))
+    assert (broken.meta["n_invalid"], clean.meta["n_invalid"]) == (1, 0)
     assert torch.equal(broken.colors, clean.colors)
     assert torch.equal(broken.alphas, clean.alphas)
     for name, grad in broken.grads.items():
@@ -67,5 +68,6 @@ def test_a_scene_of_broken_rows_only_is_background() -> None:
     scene = random_scene(6, n=3)
     scene["means"] = torch.full((3, 3), math.nan)
     rendered = run(rasterization, scene)
+    assert rendered.meta["n_invalid"] == 3
     assert torch.equal(rendered.colors, scene["backgrounds"][:, None, None].expand_as(rendered.colors))
     assert not rendered.grads["viewmats"].any()

@@ -1,13 +1,16 @@
-"""Hard cases of size: nothing to draw, one pixel, sizes that tiles don't divide, thousands of full-screen splats."""
+"""Hard cases of size: nothing to draw, one pixel, sizes that tiles don't divide, full-screen splats, memory."""
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 
 from ahoy_core.splat import rasterization
+from ahoy_core.splat._binning import to_offsets
+from ahoy_core.splat._plan import Tiling, intersection_bytes
 from tests.numerics.hard import frontal_scene
-from tests.splat.scenes import assert_matches_oracle, calm_scene, random_scene, run, select
+from tests.splat.scenes import Scene, assert_matches_oracle, calm_scene, random_scene, run, select
 
 
 @pytest.mark.parametrize(
@@ -59,3 +62,36 @@ def test_thousands_of_screen_filling_gaussians_match_the_oracle() -> None:
     scene["means"][:, 2] = 3 + torch.randperm(3000, generator=generator) / 3000
     scene["opacities"] = 0.006 + 0.001 * torch.rand(3000, generator=generator)
     assert_matches_oracle(rasterization, scene, image_atol=2e-5, grad_rtol=1e-3)
+
+
+def screen_filling(n: int, width: int, height: int) -> Scene:
+    """n Gaussians that each touch every tile."""
+    scene = frontal_scene(n, width=width, height=height)
+    return {**scene, "scales": torch.full((n, 3), 1e4)}
+
+
+def test_intersections_beyond_the_memory_budget_are_refused_before_they_are_held() -> None:
+    scene = screen_filling(500, 1024, 1024)
+    total = 500 * 64 * 64
+    with pytest.raises(MemoryError, match=rf"memory_budget: expected at most 1000000 bytes .* got {total} intersect"):
+        rasterization(**scene, memory_budget=1_000_000)
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3])
+def test_the_memory_budget_is_exact_and_does_not_change_the_image(threads: int) -> None:
+    # The near half is tiny and the far half fills the screen, so that the threads' shares are very uneven.
+    scene = screen_filling(40, 64, 64) | {"num_threads": threads}
+    near = scene["means"][:, 2].argsort()[:20]
+    scene["scales"][near] = 1e-3
+    expected, _, meta = rasterization(**scene)
+    needed = meta["n_isects"] * intersection_bytes(Tiling(64, 64, 16))
+    assert torch.equal(rasterization(**scene, memory_budget=needed)[0], expected)
+    with pytest.raises(MemoryError):
+        rasterization(**scene, memory_budget=needed - 1)
+
+
+def test_more_than_two_to_the_31_intersections_are_counted_rightly() -> None:
+    counts = np.array([[2**31, 5], [7, 2**33]], np.int64)
+    starts = to_offsets(counts)
+    assert starts.tolist() == [0, 2**31 + 7, 2**31 + 12 + 2**33]
+    assert counts.tolist() == [[0, 2**31 + 7], [2**31, 2**31 + 12]]

@@ -170,11 +170,12 @@ def flip_margin(scene: Scene, ties: bool = False) -> float:
             opacity = opacity * splats.compensation
         ys, xs = torch.meshgrid(torch.arange(H) + 0.5, torch.arange(W) + 0.5, indexing="ij")
         alphas = oracle.pixel_alphas(splats, opacity, torch.stack([xs, ys], -1).reshape(-1, 2).double())
-        cut = torch.where(alphas < 1 / 255, 0.0, alphas.clamp(max=0.999))
+        cutoff, stop = scene.get("alpha_cutoff", 1 / 255), scene.get("transmittance_stop", 1e-4)
+        cut = torch.where(alphas < cutoff, 0.0, alphas.clamp(max=0.999))
         after = torch.cumprod(1 - cut, 1)
         gaps = splats.depths.diff() / 3
         gaps = gaps[gaps > 0] if ties else gaps
-        decisions = [(alphas * 255).log(), (alphas / 0.999).log(), (after * 1e4).log(), gaps]
+        decisions = [(alphas / cutoff).log(), (alphas / 0.999).log(), (after / stop).log(), gaps]
         x, y, z = (scene["means"] @ viewmat[:3, :3].T + viewmat[:3, 3]).unbind(-1)
         decisions.append((z - near) / 3)
         if not ortho:

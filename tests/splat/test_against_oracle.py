@@ -46,6 +46,9 @@ MODES: dict[str, dict[str, Any]] = {
     },
     "eps2d 0.1": {"eps2d": 0.1},
     "planes": {"near_plane": 2.6, "far_plane": 3.4},
+    "other thresholds": {"alpha_cutoff": 1e-3, "transmittance_stop": 1e-2},
+    "forty channels": {"channels": 40},
+    "channels two at a time": {"channels": 5, "channel_chunk": 2, "render_mode": "RGB+D"},
 }  # fmt: skip
 
 
@@ -90,6 +93,7 @@ def test_gradient_of_projected_means_is_retained(backend: str) -> None:
     )  # fmt: skip
     image = image[..., :3] + (1 - image[..., 3:]) * scene["backgrounds"].double()
     (image * weights[0].double()).sum().backward()
+    assert means2d.grad is not None
     expected = torch.zeros(len(scene["means"]), 2, dtype=torch.float64).index_copy(0, splats.ids, means2d.grad)
     assert relative_l2(meta["means2d"].grad[0].double().cpu(), expected) < 1e-4
 

@@ -291,9 +291,11 @@ def test_a_limit_on_file_size_counts_as_a_full_disk(tmp_path: Path) -> None:
     assert in_child(work) == DONE
 
 
-def test_full_disks_are_recognised_in_the_words_of_other_writers() -> None:
+def test_full_disks_are_recognised_by_number_and_in_the_words_of_other_writers() -> None:
     chained = RuntimeError("cannot save")
     chained.__cause__ = OSError(errno.ENOSPC, "No space left on device")
     assert is_full(chained)
     assert is_full(RuntimeError("Error while serializing: I/O error: No space left on device (os error 28)"))
+    for number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        assert is_full(OSError(number, "in another language"))
     assert not is_full(RuntimeError("cannot save")) and not is_full(OSError(errno.EACCES, "Permission denied"))

@@ -121,9 +121,8 @@ def test_a_frame_with_a_broken_fit_writes_nothing_and_the_others_do(body: Capsul
 
 def test_a_frame_fitted_beside_the_person_is_moved_back_before_it_writes(body: CapsuleBody) -> None:
     def rings(points: np.ndarray) -> np.ndarray:
-        return np.stack(
-            [128 + 100 * np.sin(40 * points[:, 2]), 128 + 400 * points[:, 0], 90 + 0 * points[:, 0]], axis=1
-        )
+        x, z = points[:, 0], points[:, 2]
+        return np.stack([128 + 100 * np.sin(12 * z), 128 + 100 * np.sin(25 * x), 90 + 0 * x], axis=1)
 
     fit = standing(2)
     frames, masks = pictures(body, fit, rings)
@@ -146,7 +145,7 @@ def test_progress_counts_every_frame_looked_at(body: CapsuleBody) -> None:
     calls: list[tuple[int, int]] = []
     frames, masks = pictures(body, fit, smooth_paint)
     build_texture(frames, masks, fit, body, SMALL, lambda *call: calls.append(call), body.rest.numpy())
-    assert calls == [(1, 3), (2, 3), (3, 3)]
+    assert calls == [(done, 6) for done in range(1, 7)]  # three frames vote, three write
 
 
 def test_every_frame_is_chosen_or_rejected_for_one_reason() -> None:

@@ -1,0 +1,144 @@
+"""All frames into one observed atlas: a first pass asks what most frames show, a second one writes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+
+from ahoy_core.body.model import BodyModel
+from ahoy_core.texture.atlas import AtlasAccumulator, ObservedAtlas
+from ahoy_core.texture.consensus import LEAST_VOTES, Consensus, Votes
+from ahoy_core.texture.inputs import TextureConfig
+from ahoy_core.texture.rays import FloatArray, IntArray
+from ahoy_core.texture.surface import REFERENCE_HEIGHT, SeenFrame, Surface, height_in_pixels, look, trust
+from ahoy_core.texture.texels import TexelMap
+
+Progress = Callable[[int, int], None]
+# Bodies posed in one call: enough to fill torch's vector units, few enough that vertices of long videos are never
+# held together.
+POSED_TOGETHER = 16
+# Frames that vote on a texel's colour, spread over the video: bounds the cost and the memory of the first pass.
+VOTING_FRAMES = 16
+
+
+@dataclass(frozen=True)
+class Log:
+    """By frame number: texels written, and the shift (x, y in pixels) found before writing."""
+
+    written: dict[int, int] = field(default_factory=dict)
+    shifts: dict[int, tuple[float, float]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Clip:
+    """Frames [T,H,W,3] uint8, visible masks [T,H,W] uint8, the arrays of body.npz, the body and the knobs."""
+
+    frames: IntArray
+    visible: IntArray
+    fit: Mapping[str, np.ndarray]
+    body: BodyModel
+    surface: Surface
+    config: TextureConfig
+
+
+def accumulate(
+    clip: Clip, texels: TexelMap, points: FloatArray, chosen: list[int], progress: Progress | None = None
+) -> tuple[ObservedAtlas, Log]:
+    """The observed atlas of the chosen frames, and what happened on the way.
+
+    Args:
+        clip: the video and its fit.
+        texels: the atlas's N texels.
+        points: [N,3] where they are on the canonical body, metres.
+        chosen: frame numbers, in the order of writing.
+        progress: called with frames done and frames in all, of both passes.
+    """
+    config, voters = clip.config, _voters(chosen, clip.config)
+    total, done = len(voters) + len(chosen), 0
+    consensus = None
+    if voters:
+        votes, atlas = Votes(len(texels.face), len(voters)), _atlas(clip, texels, None)
+        for t, seen, _ in _looks(clip, atlas, voters):
+            if seen is not None:
+                texel, rgb, _, _ = atlas.read(clip.frames[t], clip.visible[t], seen)
+                votes.add(texel, rgb)
+                atlas.add(t, clip.frames[t], clip.visible[t], seen)
+            done = _report(progress, done, total)
+        consensus = votes.consensus(points, config.outlier_levels)
+    atlas, log = _atlas(clip, texels, consensus), Log()
+    weights, fit = clip.body.lbs_weights.cpu().numpy(), clip.fit
+    for t, seen, shift in _looks(clip, atlas, chosen):
+        log.shifts[t], log.written[t] = shift, 0
+        if seen is not None:
+            confidence = fit["frame_confidence"][t] * (weights @ fit["joint_confidence"][t])
+            floor = config.min_joint_confidence * float(fit["frame_confidence"][t])
+            log.written[t] = atlas.add(t, clip.frames[t], clip.visible[t], seen, confidence, floor)
+        done = _report(progress, done, total)
+    return atlas.result(), log
+
+
+def _voters(chosen: list[int], config: TextureConfig) -> list[int]:
+    if config.outlier_levels == 0 or len(chosen) < LEAST_VOTES:
+        return []
+    rows = np.unique(np.linspace(0, len(chosen) - 1, min(VOTING_FRAMES, len(chosen))).round().astype(int))
+    return [chosen[row] for row in rows]
+
+
+def _atlas(clip: Clip, texels: TexelMap, consensus: Consensus | None) -> AtlasAccumulator:
+    return AtlasAccumulator(clip.surface, texels, clip.config.mode, clip.config.grazing_cos, consensus)
+
+
+def _report(progress: Progress | None, done: int, total: int) -> int:
+    if progress is not None:
+        progress(done + 1, total)
+    return done + 1
+
+
+def _looks(
+    clip: Clip, atlas: AtlasAccumulator, numbers: list[int]
+) -> Iterator[tuple[int, SeenFrame | None, tuple[float, float]]]:
+    """Frames looked at and moved to where they agree with the atlas; None for a frame whose body is not finite."""
+    config, K = clip.config, clip.fit["K"]
+    for t, vertices in _posed(clip, numbers):
+        if not np.isfinite(vertices).all():
+            yield t, None, (0.0, 0.0)
+            continue
+        seen = look(
+            clip.surface,
+            vertices,
+            clip.fit["viewmat"],
+            K,
+            clip.visible[t],
+            grazing_cos=config.grazing_cos,
+            boundary_px=config.boundary_px,
+        )
+        reach = config.align_px * height_in_pixels(seen.hits) / REFERENCE_HEIGHT
+        shift = atlas.shift(clip.frames[t], seen, reach)
+        if shift != (0.0, 0.0):
+            moved = _shifted(K, shift)
+            seen = trust(clip.surface, seen.caster, moved, clip.visible[t], config.grazing_cos, config.boundary_px)
+        yield t, seen, shift
+
+
+def _shifted(K: FloatArray, shift: tuple[float, float]) -> FloatArray:
+    moved = np.array(K, dtype=np.float64)
+    moved[:2, 2] += shift
+    return moved
+
+
+def _posed(clip: Clip, chosen: list[int]) -> Iterator[tuple[int, FloatArray]]:
+    """Frame numbers and posed vertices [V,3], a few frames posed at a time."""
+    body, fit = clip.body, clip.fit
+    like = body.lbs_weights
+    betas = torch.as_tensor(fit["betas"]).to(like)
+    for start in range(0, len(chosen), POSED_TOGETHER):
+        numbers = chosen[start : start + POSED_TOGETHER]
+        pose, transl, expression = (
+            torch.as_tensor(fit[name][numbers]).to(like) for name in ("pose", "transl", "expression")
+        )
+        with torch.no_grad():
+            output = body(pose, betas.expand(len(numbers), -1), transl, expression)
+        yield from zip(numbers, output.vertices.cpu().numpy(), strict=True)
