@@ -3,8 +3,8 @@
     floor = pairs x (F + B) / (lanes x issue x clock)
 
 `pairs` is what blends (alpha >= 1/255, transmittance > 1e-4), counted pixel by pixel; `F` and `B` are the vector
-instructions that one pair costs forward and backward, with every load, store, address, sort and projection free; `lanes`
-is the 8 float32 of AVX2, `issue` 2 vector instructions a cycle. CPU time, so the number of threads does not enter.
+instructions that one pair costs forward and backward, with every load, store, address, sort and projection free;
+`lanes` is the 8 float32 of AVX2, `issue` 2 vector instructions a cycle. CPU time, so threads do not enter.
 """
 
 from __future__ import annotations

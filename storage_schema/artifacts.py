@@ -1,8 +1,8 @@
 """What each stage leaves in the store: the files, and the arrays inside them.
 
-A stage's artifact is a folder of files. `ARTIFACTS[stage]` names them; `check` (called at commit) opens every `.npz` and
-compares its arrays with the declaration, so that a stage cannot publish something its readers do not expect. Letters in a
-shape are sizes that must agree within one artifact (T frames, H x W pixels, J joints, ...).
+A stage's artifact is a folder of files. `ARTIFACTS[stage]` names them; `check` (called at commit) opens every `.npz`
+and compares its arrays with the declaration, so that a stage cannot publish something its readers do not expect.
+Letters in a shape are sizes that must agree within one artifact (T frames, H x W pixels, J joints, ...).
 """
 
 from __future__ import annotations

@@ -14,6 +14,7 @@ PRESETS: Mapping[Preset, Settings] = {
             "ingest.max_frames=48",
             "ingest.max_size=384",
             "texture.atlas_size=256",
+            "texture.frame_stride=2",
             "texture.canonical_height=256",
             "texture.canonical_width=192",
             "coarse.map_size=128",
@@ -33,7 +34,7 @@ PRESETS: Mapping[Preset, Settings] = {
             "texture.canonical_height=1024",
             "texture.canonical_width=768",
             "coarse.map_size=512",
-            "coarse.steps=400",
+            "coarse.steps=200",
             "animate.height=768",
             "animate.width=576",
         )

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from ahoy_core.perceive.perceive import Perception
 
 TILE_HEIGHT = 360
+SHEET_WIDTH = 2600  # pixels
 MASK_TINT = (60, 200, 90)
 BONES = (
     (11, 12), (11, 13), (13, 15), (12, 14), (14, 16), (11, 23), (12, 24), (23, 24), (23, 25),
@@ -25,7 +26,7 @@ LEFT, RIGHT, UNSEEN = (255, 170, 40), (60, 170, 255), (150, 150, 150)
 
 
 def contact_sheet(
-    frames: NDArray[np.uint8], perception: Perception, body: BodyModel, columns: int = 4, rows: int = 2
+    frames: NDArray[np.uint8], perception: Perception, body: BodyModel, columns: int | None = None, tiles: int = 8
 ) -> NDArray[np.uint8]:
     """Draw evenly spaced used frames: left half of each tile the mask and landmarks, right half the fitted body.
 
@@ -33,19 +34,18 @@ def contact_sheet(
         frames: [T,H,W,3] sRGB.
         perception: what was perceived in them.
         body: the body that was fitted.
-        columns: tiles across.
-        rows: tiles down, at most.
+        columns: tiles across; as many as fit `SHEET_WIDTH` unless given.
+        tiles: at most this many.
 
     Returns:
         [H',W',3] uint8.
     """
     used = np.flatnonzero(perception.used)
-    chosen = used[np.unique(np.linspace(0, len(used) - 1, columns * rows).round().astype(int))]
-    tiles = [np.concatenate(draw_frame(frames[t], perception, body, int(t)), axis=1) for t in chosen]
-    blank = np.zeros_like(tiles[0])
-    tiles += [blank] * (-len(tiles) % columns if len(tiles) > columns else 0)
-    width = min(columns, len(tiles))
-    return np.concatenate([np.concatenate(tiles[i : i + width], axis=1) for i in range(0, len(tiles), width)])
+    chosen = used[np.unique(np.linspace(0, len(used) - 1, tiles).round().astype(int))]
+    drawn = [np.concatenate(draw_frame(frames[t], perception, body, int(t)), axis=1) for t in chosen]
+    across = min(columns or max(1, SHEET_WIDTH // drawn[0].shape[1]), len(drawn))
+    drawn += [np.zeros_like(drawn[0])] * (-len(drawn) % across)
+    return np.concatenate([np.concatenate(drawn[i : i + across], axis=1) for i in range(0, len(drawn), across)])
 
 
 def draw_frame(

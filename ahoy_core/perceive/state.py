@@ -122,7 +122,7 @@ def _columns(lever: Tensor, turning: Tensor, by_shape: Tensor) -> Tensor:
 
 
 def _by_shape(reduced: ReducedBody, rotations: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """Derivatives by betas, the root joint held, of landmarks [N,33,3,S] and joints [N,F,3,S]: both are linear in them."""
+    """Derivatives of landmarks [N,33,3,S] and joints [N,F,3,S] by betas with the root joint held: linear in them."""
     landmarks, joints = [], []
     for moment, rest in zip(reduced.moment_slopes, reduced.joint_slopes, strict=True):
         shift = -rest[:1].expand(len(rotations), -1)

@@ -27,12 +27,11 @@ Array = NDArray[Any]
 class Projected(NamedTuple):
     """What C cameras see of N Gaussians; rows with radius 0 are not visible and hold zeros.
 
-    The first five are differentiable. factors (a, b, c) give KAPPA d^T Sigma^-1 d = (a dx + b dy)^2 + (c dy)^2.
+    The first four are differentiable. factors (a, b, c) give KAPPA d^T Sigma^-1 d = (a dx + b dy)^2 + (c dy)^2.
     """
 
     means2d: Tensor  # [C,N,2] pixels
     depths: Tensor  # [C,N] camera z, metres
-    conics: Tensor  # [C,N,3] inverse 2D covariance xx, xy, yy
     factors: Tensor  # [C,N,3]
     compensations: Tensor  # [C,N], [0,N] unless antialiased
     radii: Tensor  # [C,N,2] int32 pixels
@@ -57,7 +56,7 @@ class _Project(torch.autograd.Function):
         features: Tensor, cameras: Array, antialiased: bool, threads: int,
     ) -> tuple[Tensor, ...]:  # fmt: skip
         count, total = len(cameras), len(means)
-        means2d, residuals, conics, factors = (opacities.new_empty(count, total, k) for k in (2, 2, 3, 3))
+        means2d, residuals, factors = (opacities.new_empty(count, total, k) for k in (2, 2, 3))
         depths, compensations = (
             opacities.new_empty(count, total),
             opacities.new_empty(count if antialiased else 0, total),
@@ -66,7 +65,7 @@ class _Project(torch.autograd.Function):
         keys = torch.empty((count, total), dtype=torch.float64)
         spans = split(total, threads)
         inputs = [_numpy(t) for t in (means, quats, scales, covars, opacities)]
-        outputs = [_numpy(t) for t in (radii, means2d, residuals, depths, conics, factors, compensations, keys)]
+        outputs = [_numpy(t) for t in (radii, means2d, residuals, depths, factors, compensations, keys)]
         seen, marks = _numpy(features), _numpy(invalid)
         for c in range(count):
             own = [
@@ -85,7 +84,7 @@ class _Project(torch.autograd.Function):
         ctx.cameras, ctx.spans, ctx.view_dtype = cameras, spans, viewmats.dtype
         ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(radii, residuals, keys, invalid)
-        return means2d, depths, conics, factors, compensations, radii, residuals, keys, invalid
+        return means2d, depths, factors, compensations, radii, residuals, keys, invalid
 
     @staticmethod
     @once_differentiable
@@ -96,8 +95,8 @@ class _Project(torch.autograd.Function):
         outputs, seen = [_numpy(t) for t in v_inputs], _numpy(radii)
         pose = np.zeros((len(ctx.spans), len(ctx.cameras), 12))
         dtype = inputs[4].dtype
-        nothing = [np.empty((0, *size), dtype) for size in ((2,), (), (3,), (3,), ())]
-        given = [None if g is None or len(g) == 0 else _numpy(g.contiguous()) for g in grads[:5]]
+        nothing = [np.empty((0, *size), dtype) for size in ((2,), (), (3,), ())]
+        given = [None if g is None or len(g) == 0 else _numpy(g.contiguous()) for g in grads[:4]]
         for c in range(len(ctx.cameras)):
             v = [none if g is None else g[c] for g, none in zip(given, nothing, strict=True)]
             fixed = [ctx.cameras[c], *inputs, seen[c], *v, *outputs]
@@ -187,19 +186,22 @@ class _Blend(torch.autograd.Function):
                                     coverage[c], keep))  # fmt: skip
         ctx.save_for_backward(factors, opacities, features, backgrounds)
         ctx.blending, ctx.plans = blending, list(plans)
+        ctx.set_materialize_grads(False)
         return image, alphas
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, v_image: Tensor, v_alphas: Tensor) -> tuple[Any, ...]:
+    def backward(ctx: Any, v_image: Tensor | None, v_alphas: Tensor | None) -> tuple[Any, ...]:
         factors, opacities, features, backgrounds = ctx.saved_tensors
         count, rows, channels = len(ctx.plans), opacities.shape[1], features.shape[-1]
+        v_image = _gradient_image(v_image, ctx, features)
+        v_alphas = features.new_empty(count, 0, 0, 0) if v_alphas is None else v_alphas.contiguous()
         v_means2d, v_factors = (features.new_empty(count, rows, k) for k in (2, 3))
         v_opacities, v_features = features.new_empty(count, rows), torch.zeros_like(features)
         outputs, own = [_numpy(t) for t in (v_means2d, v_factors, v_opacities)], _numpy(v_features)
         inputs, pixels = (
             [_numpy(t) for t in (factors, opacities)],
-            [_numpy(t.contiguous()) for t in (v_image, v_alphas)],
+            [_numpy(t) for t in (v_image, v_alphas)],
         )
         v_backgrounds, spans = np.zeros((count, channels)), split(rows, ctx.blending.threads)
         for c, plan in enumerate(ctx.plans):
@@ -214,6 +216,14 @@ class _Blend(torch.autograd.Function):
         return v_means2d, v_factors, v_opacities, v_features, v_back, *(None,) * 5
 
 
+def _gradient_image(v_image: Tensor | None, ctx: Any, features: Tensor) -> Tensor:
+    """The image's gradient as the kernels read it; zeros if only the alphas were used."""
+    if v_image is not None:
+        return v_image.contiguous()
+    tiling = ctx.blending.tiling
+    return features.new_zeros(len(ctx.plans), tiling.height, tiling.width, features.shape[-1])
+
+
 def _render(
     blending: Blending, plan: Plan, background: Array, image: Array, alphas: Array, keep: bool
 ) -> tuple[Array, Array]:
@@ -221,7 +231,8 @@ def _render(
     tiling, dtype, tiles = blending.tiling, image.dtype, len(plan.starts) - 1
     grid, limits, like = tiling.grid(dtype), blending.limits(dtype), (0.0,) * len(background)
     rests = np.empty((tiles if keep else 0, tiling.tile_size**2), dtype)
-    lasts = np.empty(rests.shape, np.int32)
+    longest = int(np.diff(plan.starts).max())
+    lasts = np.empty(rests.shape, np.int16 if longest < 1 << 15 else np.int32)
     parts, size = min(blending.threads, tiles), tiling.tile_size**2 * (2 + len(like))
     run_parts(
         lambda p: _blend.blend_forward(
@@ -237,11 +248,12 @@ def _moments(
     blending: Blending, plan: Plan, kept: tuple[Array, Array], background: Array, v_image: Array, v_alphas: Array,
     has_background: bool,
 ) -> tuple[Array, Array]:  # fmt: skip
-    """Moments of one camera [P,M,6+D] and the gradient of its background [D]."""
+    """Moments of one camera [M,6+D], threads added in their order, and the gradient of its background [D]."""
     tiling, dtype, tiles = blending.tiling, v_image.dtype, len(plan.starts) - 1
     grid, limits, like = tiling.grid(dtype), blending.limits(dtype), (0.0,) * len(background)
     parts, size = min(blending.threads, tiles), tiling.tile_size**2 * (2 + len(like))
-    sums = np.zeros((parts, len(plan.records), sums_width(_blend_backward.MOMENTS + len(like))), dtype)
+    width = sums_width(_blend_backward.MOMENTS + len(like))
+    sums = [np.zeros((len(plan.records), width), dtype) for _ in range(parts)]
     v_background = np.zeros((parts, v_image.shape[2] if has_background else 0))
     run_parts(
         lambda p: _blend_backward.blend_backward(
@@ -250,7 +262,9 @@ def _moments(
         ),
         parts,
     )  # fmt: skip
-    return sums, v_background.sum(0) if has_background else np.zeros(v_image.shape[2])
+    while len(sums) > 1:
+        sums[0] += sums.pop(1)
+    return sums[0], v_background.sum(0) if has_background else np.zeros(v_image.shape[2])
 
 
 def blend(

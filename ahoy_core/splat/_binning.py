@@ -65,7 +65,7 @@ def to_offsets(counts: Any) -> Any:
 def pack_records(
     start: int, stop: int, first: int, radii: Any, means2d: Any, residuals: Any, factors: Any, opacities: Any,
     features: Any, order_keys: Any, tile_size: int, tiles_x: int, tiles_y: int, cursors: Any,
-    records: Any, owners: Any, slots: Any, keys: Any, sequence: Any,
+    records: Any, slots: Any, keys: Any, sequence: Any,
 ) -> None:  # fmt: skip
     """Write the records of rows [start, stop); sequence[first:] lists their slots in the order of the input."""
     channels, stride = features.shape[1], records.shape[1]
@@ -86,7 +86,7 @@ def pack_records(
             slots[row] = slot
             if slot < 0:
                 continue
-            owners[slot], keys[slot], sequence[first] = row, order_keys[row], slot
+            keys[slot], sequence[first] = order_keys[row], slot
             first += 1
             for k in range(2):
                 records[slot, k], records[slot, 2 + k] = means2d[row, k], residuals[row, k]
@@ -267,10 +267,3 @@ def fill_tiles(
             cursors[tiles[at]] += 1
             ids[place], out_masks[place] = slot, masks[at]
             at += 1
-
-
-@kernel
-def tiles_per_gaussian(slots: Any, per_slot: Any, out: Any) -> None:
-    """Tiles met by each row of the input, 0 for what is not visible."""
-    for i in range(len(slots)):
-        out[i] = per_slot[slots[i]] if slots[i] >= 0 else 0

@@ -72,9 +72,9 @@ def finish_tile(
         rest = maximum(before, -before)
         channel_blend(behind, rest, state, block * stride + 2 * LANES)
         if rests.shape[0] > 0:
-            place = tile * rests.shape[1] + block * LANES
-            store(rests, place, rest)
-            store(lasts, place, load(last, block * LANES))
+            store(rests, tile * rests.shape[1] + block * LANES, rest)
+            for lane in range(LANES):
+                lasts[tile, block * LANES + lane] = last[block * LANES + lane]
 
 
 @kernel

@@ -37,7 +37,7 @@ def load_tile(x: int, y: int, side: int, like: Any, v_image: Any, v_alphas: Any,
         for row in range(rows):
             for column in range(columns):
                 lane = 4 * row + column
-                state[base + lane] = v_alphas[top + row, left + column, 0]
+                state[base + lane] = v_alphas[top + row, left + column, 0] if v_alphas.shape[0] > 0 else 0.0
                 for k in range(len(like)):
                     if k < channels:
                         state[base + (k + 1) * LANES + lane] = v_image[top + row, left + column, k]
@@ -55,10 +55,11 @@ def start_suffix(
     stride, furthest = (2 + len(like)) * LANES, -1
     behind = splat_channels(background, 0, like)
     for block in range(side * side):
-        base, place = block * stride, tile * rests.shape[1] + block * LANES
-        rest, ranks = load(rests, place), load(lasts, place)
+        base, rest = block * stride, load(rests, tile * rests.shape[1] + block * LANES)
         store(state, base, rest)
-        store(last, block * LANES, ranks)
+        for lane in range(LANES):
+            last[block * LANES + lane] = lasts[tile, block * LANES + lane]
+        ranks = load(last, block * LANES)
         carried = channel_dot(behind, state, base + 2 * LANES) - load(state, base + LANES)
         store(state, base + LANES, rest * carried)
         deepest[block] = lane_max(ranks)
@@ -145,21 +146,6 @@ def blend_backward(
 
 
 @kernel
-def add_threads(slot: int, lane: int, sums: Any, v_row: Any, scratch: Any) -> None:
-    """Add up the threads' sums of one slot, in their order: moments to scratch, channels to v_row."""
-    for k in range(MOMENTS):
-        total = 0.0
-        for p in range(sums.shape[0]):
-            total += sums[p, slot, k]
-        scratch[k * LANES + lane] = total
-    for k in range(v_row.shape[0]):
-        total = 0.0
-        for p in range(sums.shape[0]):
-            total += sums[p, slot, MOMENTS + k]
-        v_row[k] += total
-
-
-@kernel
 def moments_to_gradients(scratch: Any) -> None:
     """Columns of scratch: moments (6), factors (3), opacity become gradients of mean (2), factors and opacity."""
     hu, hw = load(scratch, LANES), load(scratch, 2 * LANES)
@@ -180,18 +166,20 @@ def gather_gradients(
     start: int, stop: int, slots: Any, factors: Any, opacities: Any, sums: Any, v_means2d: Any, v_factors: Any,
     v_opacities: Any, v_features: Any,
 ) -> None:  # fmt: skip
-    """Moments of all threads [P, slots, 6 + D] -> gradients of rows [start, stop); 0 where not visible."""
+    """Moments [slots, 6 + D] -> gradients of rows [start, stop); 0 where not visible."""
     scratch = np.ones(10 * LANES)
     for i in range(start, stop, LANES):
         count = min(LANES, stop - i)
         for row in range(min(i + LANES, stop), min(i + 2 * LANES, stop)):
             if slots[row] >= 0:
-                for p in range(sums.shape[0]):
-                    prefetch(sums, (p * sums.shape[1] + slots[row]) * sums.shape[2])
-                    prefetch(sums, (p * sums.shape[1] + slots[row] + 1) * sums.shape[2] - 1)
+                prefetch(sums, slots[row] * sums.shape[1])
+                prefetch(sums, (slots[row] + 1) * sums.shape[1] - 1)
         for lane in range(count):
             if slots[i + lane] >= 0:
-                add_threads(slots[i + lane], lane, sums, v_features[i + lane], scratch)
+                for k in range(MOMENTS):
+                    scratch[k * LANES + lane] = sums[slots[i + lane], k]
+                for k in range(v_features.shape[1]):
+                    v_features[i + lane, k] += sums[slots[i + lane], MOMENTS + k]
                 for k in range(3):
                     scratch[(6 + k) * LANES + lane] = factors[i + lane, k]
                 scratch[9 * LANES + lane] = opacities[i + lane]

@@ -59,12 +59,23 @@ class Plan:
     """Slots 0..M-1 are the visible Gaussians by tile; intersections are sorted by tile, then by depth."""
 
     records: Array  # [M,R] see _binning.HEAD, then the channels, padded
-    owners: Array  # [M] row of the input
     slots: Array  # [N] slot of each row of the input, -1 if not visible
     starts: Array  # [T+1] first intersection of each tile
     ids: Array  # [I] slot
     masks: Array  # [I] blocks of the tile that may be touched
-    tiles_per_gauss: Array  # [N]
+
+    def owners(self) -> Array:
+        """Row of the input of each slot, [M]."""
+        rows = np.flatnonzero(self.slots >= 0).astype(np.int32)
+        owners = np.empty(len(self.records), np.int32)
+        owners[self.slots[rows]] = rows
+        return owners
+
+    def tiles_per_gauss(self) -> Array:
+        """Tiles met by each row of the input, [N]."""
+        counts = np.zeros(len(self.slots), np.int32)
+        counts[self.owners()] = np.bincount(self.ids, minlength=len(self.records))
+        return counts
 
 
 def padded_channels(channels: int) -> int:
@@ -104,26 +115,22 @@ def make_plan(
     first, total = np.concatenate([[0], np.cumsum(visible)]), sum(visible)
     stride = binning.HEAD + padded_channels(features.shape[1])
     records = np.empty((total, stride), features.dtype)
-    owners, sequence = np.empty(total, np.int32), np.empty(total, np.int32)
-    slots, keys = np.empty(len(radii), np.int32), np.empty(total)
+    sequence, slots, keys = np.empty(total, np.int32), np.empty(len(radii), np.int32), np.empty(total)
     run_parts(
         lambda p: binning.pack_records(
             *spans[p], first[p], *projected, features, order_keys, size, tx, ty,
-            homes[p], records, owners, slots, keys, sequence,
+            homes[p], records, slots, keys, sequence,
         ),
         len(spans),
     )  # fmt: skip
     binning.sort_by_depth(keys, sequence)
-    starts, ids, masks, per_slot = _intersect(tiling, sequence, records, log2_cutoff, budget, threads)
-    tiles_per_gauss = np.empty(len(radii), np.int32)
-    binning.tiles_per_gaussian(slots, per_slot, tiles_per_gauss)
-    return Plan(records, owners, slots, starts, ids, masks, tiles_per_gauss)
+    return Plan(records, slots, *_intersect(tiling, sequence, records, log2_cutoff, budget, threads))
 
 
 def _intersect(
     tiling: Tiling, order: Array, records: Array, log2_cutoff: float, budget: int, threads: int
-) -> tuple[Array, Array, Array, Array]:
-    """First intersections [T+1], ids [I], masks [I] and tiles per slot [M], given the slots in the order of depth."""
+) -> tuple[Array, Array, Array]:
+    """First intersections [T+1], ids [I] and masks [I], given the slots in the order of depth."""
     spans = split(len(order), threads)
     parts, tiles = len(spans), tiling.tiles_x * tiling.tiles_y
     counts, per_slot = np.zeros((parts, tiles), np.int64), np.empty(len(order), np.int32)
@@ -151,4 +158,4 @@ def _intersect(
     starts = binning.to_offsets(counts)
     ids, masks = np.empty(total, np.int32), np.empty(total, tiling.mask_dtype)
     run_parts(lambda p: binning.fill_tiles(*spans[p], order, per_slot, *found[p][:2], counts[p], ids, masks), parts)
-    return starts, ids, masks, per_slot
+    return starts, ids, masks

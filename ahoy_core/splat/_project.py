@@ -194,7 +194,7 @@ def shape_on_image(camera: Any, full: bool, scratch: Any, x: Any, y: Any, z: Any
 
 @kernel
 def project_chunk(camera: Any, full: bool, antialiased: bool, scratch: Any, out: Any) -> None:
-    """Project the gathered rows into columns of out: reach (2; -1 if unseen), mean (2), depth, conic, factors, rho.
+    """Project the gathered rows into columns of out: reach (2; -1 if unseen), mean (2), depth, factors, rho.
 
     The reach is the half extent in pixels of the region where alpha can pass the cutoff.
     """
@@ -219,18 +219,15 @@ def project_chunk(camera: Any, full: bool, antialiased: bool, scratch: Any, out:
     store(out, 2 * LANES, mx)
     store(out, 3 * LANES, my)
     store(out, 4 * LANES, z)
-    store(out, 5 * LANES, yy * inverse)
-    store(out, 6 * LANES, -xy * inverse)
-    store(out, 7 * LANES, xx * inverse)
-    store(out, 8 * LANES, a)
-    store(out, 9 * LANES, -a * xy * inverse_yy)
-    store(out, 10 * LANES, maximum(sqrt(KAPPA * inverse_yy), TINY))
-    store(out, 11 * LANES, rho)
+    store(out, 5 * LANES, a)
+    store(out, 6 * LANES, -a * xy * inverse_yy)
+    store(out, 7 * LANES, maximum(sqrt(KAPPA * inverse_yy), TINY))
+    store(out, 8 * LANES, rho)
 
 
 @kernel
 def write_rows(
-    i: int, count: int, out: Any, radii: Any, means2d: Any, residuals: Any, depths: Any, conics: Any, factors: Any,
+    i: int, count: int, out: Any, radii: Any, means2d: Any, residuals: Any, depths: Any, factors: Any,
     compensations: Any, order_keys: Any,
 ) -> None:  # fmt: skip
     """Copy columns of out to rows i, ..., i + count - 1; zeros where not visible."""
@@ -244,28 +241,27 @@ def write_rows(
         order_keys[row] = out[4 * LANES + lane] if visible else 0.0
         depths[row] = order_keys[row]
         for k in range(3):
-            conics[row, k] = out[(5 + k) * LANES + lane] if visible else 0.0
-            factors[row, k] = out[(8 + k) * LANES + lane] if visible else 0.0
+            factors[row, k] = out[(5 + k) * LANES + lane] if visible else 0.0
         if compensations.shape[0] > 0:
-            compensations[row] = out[11 * LANES + lane] if visible else 0.0
+            compensations[row] = out[8 * LANES + lane] if visible else 0.0
 
 
 @kernel
 def project_forward(
     start: int, stop: int, camera: Any, antialiased: bool, means: Any, quats: Any, scales: Any, covars: Any,
-    opacities: Any, features: Any, radii: Any, means2d: Any, residuals: Any, depths: Any, conics: Any, factors: Any,
+    opacities: Any, features: Any, radii: Any, means2d: Any, residuals: Any, depths: Any, factors: Any,
     compensations: Any, order_keys: Any, invalid: Any,
 ) -> int:  # fmt: skip
     """Fill rows [start, stop); rows that are not visible get zeros. Returns a row with a negative scale, or -1.
 
     residuals hold what rounding took from means2d; order_keys the depth in float64, by which Gaussians are sorted.
     """
-    scratch, out, negative = np.zeros(INPUTS * LANES), np.empty(12 * LANES), -1
+    scratch, out, negative = np.zeros(INPUTS * LANES), np.empty(9 * LANES), -1
     full = covars.shape[0] > 0
     for i in range(start, stop, LANES):
         count = min(LANES, stop - i)
         gather_inputs(i, count, means, quats, scales, covars, opacities, scratch)
         negative = max(negative, check_rows(i, count, features, scales, not full, scratch, invalid))
         project_chunk(camera, full, antialiased, scratch, out)
-        write_rows(i, count, out, radii, means2d, residuals, depths, conics, factors, compensations, order_keys)
+        write_rows(i, count, out, radii, means2d, residuals, depths, factors, compensations, order_keys)
     return negative

@@ -31,8 +31,8 @@ from ahoy_core.splat._simd import load, maximum, minimum, select, splat, store
 from ahoy_core.splat._vectors import LANES
 from ahoy_core.splat.constants import KAPPA
 
-V_MEAN2D, V_DEPTH, V_CONIC, V_FACTOR, V_RHO, SEEN = 0, 2, 3, 6, 9, 10  # columns of the incoming gradients
-GRADIENTS: Final = 11
+V_MEAN2D, V_DEPTH, V_FACTOR, V_RHO, SEEN = 0, 2, 3, 6, 7  # columns of the incoming gradients
+GRADIENTS: Final = 8
 RESULTS: Final = 10  # mean (3), then quaternion (4) and scales (3), or the symmetric covariance (6)
 
 
@@ -53,15 +53,6 @@ def from_factors(xx: Any, xy: Any, yy: Any, det: Any, v: Any) -> Vecs:
 
 
 @inlined
-def from_conics(xx: Any, xy: Any, yy: Any, det: Any, v: Any) -> Vecs:
-    """Gradient of the blurred covariance from that of its inverse (yy, -xy, xx) / det."""
-    va, vb, vc = column(v, V_CONIC), column(v, V_CONIC + 1), column(v, V_CONIC + 2)
-    inverse = 1.0 / det
-    v_det = -(yy * va - xy * vb + xx * vc) * inverse * inverse
-    return vc * inverse + v_det * yy, -vb * inverse - 2.0 * v_det * xy, va * inverse + v_det * xx
-
-
-@inlined
 def from_compensation(blur: float, xx: Any, xy: Any, yy: Any, sharp: Any, det: Any, v: Any) -> Vecs:
     """Gradient of the covariance from that of sqrt(sharp / det); xx and yy include the blur.
 
@@ -77,16 +68,13 @@ def from_compensation(blur: float, xx: Any, xy: Any, yy: Any, sharp: Any, det: A
 
 
 @inlined
-def covariance_gradient(camera: Any, xx: Any, xy: Any, yy: Any, sharp: Any, v: Any, has: Any) -> Vecs:
-    """Sum of all that reaches the blurred covariance (xx, xy, yy); has says which gradients there are."""
+def covariance_gradient(camera: Any, xx: Any, xy: Any, yy: Any, sharp: Any, v: Any, antialiased: bool) -> Vecs:
+    """Sum of all that reaches the blurred covariance (xx, xy, yy)."""
     blur = camera[cam.EPS2D]
     det = sharp + blur * (xx + yy) + blur * blur
     xx, yy = xx + blur, yy + blur
     g0, g1, g2 = from_factors(xx, xy, yy, det, v)
-    if has[0]:
-        h0, h1, h2 = from_conics(xx, xy, yy, det, v)
-        g0, g1, g2 = g0 + h0, g1 + h1, g2 + h2
-    if has[1]:
+    if antialiased:
         h0, h1, h2 = from_compensation(blur, xx, xy, yy, sharp, det, v)
         g0, g1, g2 = g0 + h0, g1 + h1, g2 + h2
     return g0, g1, g2
@@ -177,29 +165,31 @@ def add_pose(pose: Any, k: int, seen: Any, value: Any) -> None:
 
 
 @inlined
-def shape_backward(camera: Any, full: bool, rows: Vecs, scratch: Any, v: Any, has: Any, out: Any) -> Vecs:
+def shape_backward(camera: Any, full: bool, rows: Vecs, scratch: Any, v: Any, antialiased: bool, out: Any) -> Vecs:
     """Write the gradients of the shape's inputs; returns that of the rows J R_cam."""
     if full:
         S = symmetric(scratch)
         xx, xy, yy, sharp = covariance_of_full(rows, S)
-        return to_covars(rows, S, covariance_gradient(camera, xx, xy, yy, sharp, v, has), out)
+        return to_covars(rows, S, covariance_gradient(camera, xx, xy, yy, sharp, v, antialiased), out)
     q = unit_quaternion(scratch)
     R = rotation(q[0], q[1], q[2], q[3])
     sx, sy, sz = column(scratch, SHAPE + 4), column(scratch, SHAPE + 5), column(scratch, SHAPE + 6)
     B = half_covariance(rows, R, sx, sy, sz)
     xx, xy, yy, sharp = covariance_of_half(B)
-    g = covariance_gradient(camera, xx, xy, yy, sharp, v, has)
+    g = covariance_gradient(camera, xx, xy, yy, sharp, v, antialiased)
     return to_quats_and_scales(rows, B, g, q, R, scratch, out)
 
 
 @kernel
-def project_chunk_backward(camera: Any, full: bool, scratch: Any, v: Any, has: Any, out: Any, pose: Any) -> None:
+def project_chunk_backward(
+    camera: Any, full: bool, scratch: Any, v: Any, antialiased: bool, out: Any, pose: Any
+) -> None:
     """Gradients of sixteen gathered rows into columns of out; those of [R | t] are added to pose [12 x 16]."""
     wx, wy, wz = column(scratch, MEAN), column(scratch, MEAN + 1), column(scratch, MEAN + 2)
     seen = column(v, SEEN) > 0.0
     x, y, z = to_camera(camera, wx, wy, wz)
     j = jacobian(camera, x, y, z)
-    r = shape_backward(camera, full, world_rows(camera, j), scratch, v, has, out)
+    r = shape_backward(camera, full, world_rows(camera, j), scratch, v, antialiased, out)
     v_j = (
         r[0] * camera[0] + r[1] * camera[1] + r[2] * camera[2], r[0] * camera[6] + r[1] * camera[7] + r[2] * camera[8],
         r[3] * camera[3] + r[4] * camera[4] + r[5] * camera[5], r[3] * camera[6] + r[4] * camera[7] + r[5] * camera[8],
@@ -220,7 +210,7 @@ def project_chunk_backward(camera: Any, full: bool, scratch: Any, v: Any, has: A
 
 @kernel
 def gather_gradients_in(
-    i: int, count: int, radii: Any, v_means2d: Any, v_depths: Any, v_conics: Any, v_factors: Any, v_comps: Any, v: Any
+    i: int, count: int, radii: Any, v_means2d: Any, v_depths: Any, v_factors: Any, v_comps: Any, v: Any
 ) -> bool:
     """Columns of the incoming gradients of rows i, ...; arrays without rows count as zero. Whether any row was seen."""
     seen = False
@@ -233,8 +223,6 @@ def gather_gradients_in(
         if v_depths.shape[0] > 0:
             v[V_DEPTH * LANES + lane] = v_depths[row]
         for k in range(3):
-            if v_conics.shape[0] > 0:
-                v[(V_CONIC + k) * LANES + lane] = v_conics[row, k]
             if v_factors.shape[0] > 0:
                 v[(V_FACTOR + k) * LANES + lane] = v_factors[row, k]
         if v_comps.shape[0] > 0:
@@ -273,19 +261,19 @@ def add_rows(
 @kernel
 def project_backward(
     start: int, stop: int, camera: Any, means: Any, quats: Any, scales: Any, covars: Any, opacities: Any, radii: Any,
-    v_means2d: Any, v_depths: Any, v_conics: Any, v_factors: Any, v_comps: Any,
+    v_means2d: Any, v_depths: Any, v_factors: Any, v_comps: Any,
     v_means: Any, v_quats: Any, v_scales: Any, v_covars: Any, pose: Any,
 ) -> None:  # fmt: skip
     """Add one camera's gradients of rows [start, stop) to the v_ arrays and to pose [12]; unseen rows are skipped."""
     scratch, v, out = np.zeros(INPUTS * LANES), np.zeros(GRADIENTS * LANES), np.empty(RESULTS * LANES)
     sums, full = np.zeros(12 * LANES), covars.shape[0] > 0
-    has = (v_conics.shape[0] > 0, v_comps.shape[0] > 0)
+    antialiased = v_comps.shape[0] > 0
     for i in range(start, stop, LANES):
         count = min(LANES, stop - i)
-        if not gather_gradients_in(i, count, radii, v_means2d, v_depths, v_conics, v_factors, v_comps, v):
+        if not gather_gradients_in(i, count, radii, v_means2d, v_depths, v_factors, v_comps, v):
             continue
         gather_inputs(i, count, means, quats, scales, covars, opacities, scratch)
-        project_chunk_backward(camera, full, scratch, v, has, out, sums)
+        project_chunk_backward(camera, full, scratch, v, antialiased, out, sums)
         add_rows(i, count, full, v, out, v_means, v_quats, v_scales, v_covars)
     for k in range(12):
         pose[k] += lane_sum(load(sums, k * LANES))

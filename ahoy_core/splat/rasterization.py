@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Literal
 
 import numpy as np
@@ -166,18 +167,34 @@ def _in_chunks(
 
 
 class _Meta(dict[str, Any]):
-    """gsplat's meta; flatten_ids, as long as the intersections, is made when first read."""
+    """gsplat's meta; what is large and seldom read is made when first read."""
 
-    def __init__(self, values: dict[str, Any], plans: list[Plan]) -> None:
+    def __init__(self, values: dict[str, Any], later: dict[str, Callable[[], Tensor]]) -> None:
         super().__init__(values)
-        self._plans = plans
+        self._later = later
 
     def __missing__(self, key: str) -> Any:
-        if key != "flatten_ids":
-            raise KeyError(key)
-        ids = [plan.owners[plan.ids] + c * len(plan.slots) for c, plan in enumerate(self._plans)]
-        self[key] = torch.from_numpy(np.concatenate(ids))
+        self[key] = self._later[key]()
         return self[key]
+
+    def __contains__(self, key: object) -> bool:
+        return super().__contains__(key) or key in self._later
+
+    def get(self, key: str, default: Any = None) -> Any:
+        """Value of a key, made if need be."""
+        return self[key] if key in self else default
+
+
+def _conics(factors: Tensor) -> Tensor:
+    """Inverse 2D covariances [C,N,3] xx, xy, yy of the factors (a, b, c)."""
+    a, b, c = factors.unbind(-1)
+    return torch.stack([a * a, a * b, b * b + c * c], -1) / constants.KAPPA
+
+
+def _flatten_ids(plans: list[Plan]) -> Tensor:
+    """Row of [C,N] of every intersection, by camera, tile and depth."""
+    ids = [plan.owners()[plan.ids] + c * len(plan.slots) for c, plan in enumerate(plans)]
+    return torch.from_numpy(np.concatenate(ids))
 
 
 def _meta(projected: Projected, opacities: Tensor, plans: list[Plan], tiling: Tiling) -> dict[str, Any]:
@@ -188,9 +205,7 @@ def _meta(projected: Projected, opacities: Tensor, plans: list[Plan], tiling: Ti
         "radii": projected.radii,
         "means2d": projected.means2d,
         "depths": projected.depths,
-        "conics": projected.conics,
         "opacities": opacities,
-        "tiles_per_gauss": torch.from_numpy(np.stack([plan.tiles_per_gauss for plan in plans])),
         "isect_offsets": torch.from_numpy(offsets.reshape(-1, tiling.tiles_y, tiling.tiles_x)),
         "n_isects": int(totals[-1]),
         "n_invalid": int(projected.invalid.sum()),
@@ -201,4 +216,10 @@ def _meta(projected: Projected, opacities: Tensor, plans: list[Plan], tiling: Ti
         "tile_size": tiling.tile_size,
         "n_cameras": len(plans),
     }
-    return _Meta(values, plans)
+    factors = projected.factors
+    later = {
+        "conics": lambda: _conics(factors),
+        "flatten_ids": lambda: _flatten_ids(plans),
+        "tiles_per_gauss": lambda: torch.from_numpy(np.stack([plan.tiles_per_gauss() for plan in plans])),
+    }
+    return _Meta(values, later)

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 
 from ahoy_core.avatar.files import load_avatar
-from ahoy_core.body.packaged import load_packaged_body
 from ahoy_core.body.canonical import canonical_pose
+from ahoy_core.body.packaged import load_packaged_body
 from ahoy_core.formats.ply import read_ply
 from ahoy_core.formats.video import probe, read_frames
 from storage_schema.store import ArtifactStore

@@ -77,8 +77,8 @@ POSITION = (
     Mutant(
         "camera kept in float32",
         "ahoy_core/splat/_camera.py",
-        "packed = np.empty((len(viewmats), SIZE))",
-        "packed = np.empty((len(viewmats), SIZE), np.float32).astype(np.float32)",
+        "return packed",
+        "return packed.astype(np.float32).astype(np.float64)",
         (DEPTH + "a_world_shifted_by_a_million_metres_in_float64_looks_the_same",),
     ),
     Mutant(

@@ -37,7 +37,8 @@ def test_gaussians_far_off_the_frustum_match_the_oracle(offset: float) -> None:
     def edit(scene: Scene) -> Scene:
         points = [[offset, 0.3, 3.0], [0.1, -offset, 2.0], [offset, offset, 0.011], [offset, 0, offset / 2]]
         means = camera_space(scene, torch.tensor(points))
-        return with_rows(scene, [0, 1, 2, 3], means=means, scales=0.3, opacities=0.9)
+        # As wide as they are deep: with an unclamped Jacobian their images would reach the frustum from any distance.
+        return with_rows(scene, [0, 1, 2, 3], means=means, scales=3.0, opacities=0.9)
 
     assert_matches_oracle(rasterization, calm_scene(2, n=30, edit=edit))
 

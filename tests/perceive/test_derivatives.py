@@ -132,7 +132,8 @@ def test_image_derivatives_equal_automatic_ones_even_behind_the_camera(body: Pac
     person = torch.tensor([2.0]).double()
     ours = image_derivatives(points, person)
     automatic = torch.autograd.functional.jacobian(lambda p: image_offsets(p[None], seen, person)[0], points[0])
-    torch.testing.assert_close(ours[0], torch.einsum("kikc->kic", automatic), rtol=1e-9, atol=1e-12)
+    # torch's softplus is linear beyond 20, which is off by e^-20.
+    torch.testing.assert_close(ours[0], torch.einsum("kikc->kic", automatic), rtol=1e-8, atol=1e-8)
     assert torch.isfinite(ours).all()
     assert bool((safe_depth(torch.tensor([-1e6, -1.0, 0.0])) > 0).all())
 
