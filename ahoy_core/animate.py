@@ -1,4 +1,4 @@
-"""Pictures of an avatar: a turntable, a motion, a contact sheet."""
+"""Pictures of an avatar: a turntable, a motion."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from ahoy_core.avatar.render import render
 from ahoy_core.body.canonical import canonical_pose
 from ahoy_core.body.model import BodyModel
 from ahoy_core.conventions import GREY, PERSON_HEIGHT_SHARE, Cameras, turntable_cameras
+from ahoy_core.formats.images import to_uint8
 from ahoy_core.motion import Motion
 
 Frames = NDArray[np.uint8]
@@ -26,15 +27,12 @@ ELEVATION = math.radians(8)
 SHEET_VIEWS = 8
 # Cameras per call of the rasterizer: bounds its memory at any length of the clip.
 _CHUNK = 8
-
-
-def to_uint8(images: Tensor) -> Frames:
-    """Images [C,3,H,W] in [0,1] as uint8 [C,H,W,3]; what is outside the range is clipped."""
-    return (images.clamp(0, 1) * 255).round().to(torch.uint8).permute(0, 2, 3, 1).contiguous().numpy()
+# Metres: no camera comes nearer to the middle of what it looks at.
+_NEAREST = 0.1
 
 
 def framing_cameras(points: Tensor, n: int, height: int, width: int) -> Cameras:
-    """`n` cameras round the points, that all have them within 90% of the image.
+    """`n` cameras round the points, as near as they can be with all points within the middle 90% of every picture.
 
     Args:
         points: [M,3] metres, world.
@@ -45,11 +43,13 @@ def framing_cameras(points: Tensor, n: int, height: int, width: int) -> Cameras:
     low, high = points.amin(0), points.amax(0)
     center = (low + high) / 2
     focal = height / (2 * math.tan(FOV / 2))
-    # The nearest point may stand this much in front of the axis: its distance counts.
-    reach = float((points - center)[:, :2].norm(dim=1).max())
-    tall, wide = float(high[2] - low[2]) / 2 + reach * math.sin(ELEVATION), reach
-    needed = max(tall * focal / (height / 2), wide * focal / (width / 2)) / PERSON_HEIGHT_SHARE
-    return turntable_cameras(center, needed + reach, n, ELEVATION, height, width, focal)
+    around = turntable_cameras(center, 1.0, n, ELEVATION, height, width, focal).viewmats
+    # A point x right and z behind the centre is seen at focal * x / (radius + z): every point asks for a radius.
+    right, down, behind = ((points - center) @ around[:, :3, :3].transpose(1, 2)).unbind(-1)
+    wide, tall = (focal / (PERSON_HEIGHT_SHARE * side / 2) for side in (width, height))
+    asked = torch.maximum(right.abs() * wide, down.abs() * tall) - behind
+    radius = max(float(asked.max()), float((high - low).norm()), _NEAREST)
+    return turntable_cameras(center, radius, n, ELEVATION, height, width, focal)
 
 
 @torch.no_grad()
@@ -69,20 +69,15 @@ def turntable(avatar: Avatar, body: BodyModel, frames: int, height: int, width: 
     return render_views(posed, framing_cameras(_solid(posed), frames, height, width))
 
 
-def contact_sheet(frames: Frames, views: int = SHEET_VIEWS, columns: int = 4) -> Frames:
-    """Evenly chosen frames [T,H,W,3] side by side: uint8 [rows*H, columns*W, 3].
+def evenly_chosen(frames: Frames, count: int = SHEET_VIEWS) -> list[Frames]:
+    """`count` frames of [T,H,W,3], evenly spread from the first on, for a contact sheet; a short clip repeats some.
 
     Raises:
         ValueError: If there are no frames.
     """
     if len(frames) == 0:
         raise ValueError("expected at least one frame, got none; render the turntable first")
-    chosen = frames[[index * len(frames) // views for index in range(views)]]
-    height, width = chosen.shape[1:3]
-    rows = math.ceil(views / columns)
-    sheet = np.full((rows * columns, height, width, 3), round(GREY * 255), dtype=np.uint8)
-    sheet[:views] = chosen
-    return sheet.reshape(rows, columns, height, width, 3).swapaxes(1, 2).reshape(rows * height, columns * width, 3)
+    return [frames[index * len(frames) // count] for index in range(count)]
 
 
 @torch.no_grad()

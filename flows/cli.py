@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from pydantic import ValidationError
 from rich.console import Console
+from rich.markup import escape
 
 from flows import models_cli
 
@@ -71,15 +72,17 @@ def run(
         raise typer.Exit(EXIT_INTERRUPTED) from None
     except ValidationError as error:
         for problem in error.errors():
-            console.print(
-                f"[red]error:[/] --{'.'.join(map(str, problem['loc']))}: {problem['msg']}, got {problem['input']!r}"
-            )
+            _complain(console, f"--{'.'.join(map(str, problem['loc']))}: {problem['msg']}, got {problem['input']!r}")
         raise typer.Exit(EXIT_BAD_INPUT) from None
     except (ValueError, OSError) as error:
-        console.print(f"[red]error:[/] {error}", markup=True, highlight=False)
+        _complain(console, str(error))
         raise typer.Exit(EXIT_BAD_INPUT) from None
     for name, path in paths.items():
         console.print(f"{name:<20} {path}", soft_wrap=True, highlight=False)
+
+
+def _complain(console: Console, message: str) -> None:
+    console.print("[red]error:[/]", escape(message), highlight=False, soft_wrap=True)
 
 
 def _run_here(request: VideoRequest, console: Console) -> dict[str, Path]:

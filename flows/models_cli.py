@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TransferSpeedColumn
 from rich.table import Table
 
@@ -41,7 +42,7 @@ def pull() -> None:
 
             paths = model_files.pull(show)
     except model_files.ModelFileError as error:
-        console.print(f"[red]error:[/] {error}", highlight=False)
+        console.print("[red]error:[/]", escape(str(error)), highlight=False, soft_wrap=True)
         raise typer.Exit(EXIT_BAD_MODEL) from None
     console.print(f"{len(paths)} model files are in {model_files.cache_dir()}", soft_wrap=True)
 

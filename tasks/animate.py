@@ -8,10 +8,10 @@ from collections.abc import Mapping
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from ahoy_core.animate import contact_sheet, motion_frames, turntable
+from ahoy_core.animate import evenly_chosen, motion_frames, turntable
 from ahoy_core.avatar.files import load_avatar
 from ahoy_core.body.packaged import load_packaged_body
-from ahoy_core.formats.images import write_png
+from ahoy_core.formats.images import contact_sheet, write_png
 from ahoy_core.formats.ply import write_ply
 from ahoy_core.formats.video import write_mp4
 from ahoy_core.motion import wave
@@ -46,7 +46,7 @@ def run_animate(config: AnimateConfig, ctx: StageContext) -> StageOutput:
     ctx.progress(0, total, "turntable")
     turning = turntable(avatar, body, config.turntable_frames, config.height, config.width)
     write_mp4(ctx.out / "turntable.mp4", turning, config.fps, metadata=label)
-    write_png(ctx.out / "turntable.png", contact_sheet(turning))
+    write_png(ctx.out / "turntable.png", contact_sheet(evenly_chosen(turning), columns=4))
     motion = wave(body, config.motion_frames, config.fps, turning=2 * np.pi)
     moving = motion_frames(
         avatar,

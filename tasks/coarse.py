@@ -48,7 +48,7 @@ def load_inputs(ingest: Path, perceive: Path, texture: Path) -> CoarseInputs:
     """Read what equation 1 asks for from three artifact folders."""
     frames = load_npz(ingest / "frames.npz", ["frames"])["frames"]
     fit = {name: torch.from_numpy(value) for name, value in load_npz(perceive / "body.npz").items()}
-    masks = load_npz(perceive / "masks.npz", ["visible"])["visible"]
+    masks = load_npz(perceive / "masks.npz", ["visible", "amodal"])
     atlas, canonical = load_npz(texture / "atlas.npz"), load_npz(texture / "canonical.npz")
     height, width = canonical["views"].shape[1:3]
     viewmats, Ks = torch.from_numpy(canonical["viewmats"]), torch.from_numpy(canonical["Ks"])
@@ -58,7 +58,8 @@ def load_inputs(ingest: Path, perceive: Path, texture: Path) -> CoarseInputs:
         pose=fit["pose"],
         transl=fit["transl"],
         frames=torch.from_numpy(np.ascontiguousarray(np.moveaxis(frames, -1, 1))),
-        masks=torch.from_numpy(masks),
+        masks=torch.from_numpy(masks["visible"]),
+        silhouettes=torch.from_numpy(masks["amodal"]),
         viewmat=fit["viewmat"],
         K=fit["K"],
         used=fit["used"],

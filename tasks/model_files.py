@@ -8,6 +8,7 @@ a file is missing.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
@@ -234,13 +235,12 @@ def _sha256(path: Path) -> str:
 
 
 def _bytes_below(folder: Path) -> int:
-    """Sum the sizes of all files, ignoring those that vanish meanwhile."""
+    """Sum the sizes of all files. pip deletes files and folders meanwhile: `os.walk` bears that, `rglob` does not."""
     total = 0
-    for path in folder.rglob("*"):
-        try:
-            total += path.stat().st_size if path.is_file() else 0
-        except FileNotFoundError:
-            continue
+    for parent, _, names in os.walk(folder):
+        for name in names:
+            with contextlib.suppress(FileNotFoundError):
+                total += (Path(parent) / name).stat().st_size
     return total
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -13,8 +13,8 @@ from torch import Tensor
 from ahoy_core.avatar.avatar import Avatar, AvatarInfo, bake, network_config
 from ahoy_core.avatar.config import CoarseConfig
 from ahoy_core.avatar.deform import Canonical, apply_offsets, deform, dense_weights, offset_channels
-from ahoy_core.avatar.losses import masked_l1, photometric, regularisers
-from ahoy_core.avatar.render import render
+from ahoy_core.avatar.losses import Neighbourhood, masked_l1, photometric, regularisers
+from ahoy_core.avatar.render import Rendered, render
 from ahoy_core.avatar.supervision import CanonicalViews, CoarseInputs, Frame, canonical_views, observed_frames
 from ahoy_core.maps.style_unet import StyleUNet
 from ahoy_core.maps.template import Template, build_template
@@ -123,13 +123,14 @@ class _Run:
         config: CoarseConfig,
         n_joints: int,
     ) -> None:
-        self.template, self.frames, self.views, self.held_out = template, frames, views, held_out
+        self.template, self.frames, self.held_out = template, frames, held_out
+        self.views = _weigh_head(views, template, config.weights.head)
         self.config, self.n_joints = config, n_joints
         self.generator = torch.Generator().manual_seed(config.seed)
         sizes = network_config(template, config.width, offset_channels(template))
         self.network = StyleUNet(sizes, self.generator)
         self.optimizer = torch.optim.Adam(self.network.parameters(), lr=config.learning_rate, betas=(0.9, 0.99))
-        self.maps = template.maps()
+        self.maps, self.around = template.maps(), Neighbourhood.of(template)
         self.rows: list[LossRow] = []
         self.notes: list[str] = []
         self.score_of_template = self.score()
@@ -178,10 +179,19 @@ class _Run:
         for number in chosen:
             frame = self.frames[number]
             means, posed = deform(canonical.means, covars, lbs_weights, frame.relative)
-            image = render(means, posed, canonical.opacities, canonical.colors, frame.camera).images[0]
-            second = second + photometric(image, frame.target, frame.weight, config.weights.gradient) / len(chosen)
+            rendered = render(means, posed, canonical.opacities, canonical.colors, frame.camera)
+            second = second + self._frame_loss(rendered, frame) / len(chosen)
         weights = config.weights
-        return weights.canonical * first, weights.observed * second, regularisers(canonical, self.template, weights)
+        third = regularisers(canonical, self.template, self.around, weights)
+        return weights.canonical * first, weights.observed * second, third
+
+    def _frame_loss(self, rendered: Rendered, frame: Frame) -> Tensor:
+        weights, alpha = self.config.weights, rendered.alphas[0]
+        loss = photometric(rendered.images[0], frame.target, frame.weight, weights.gradient)
+        area = frame.weight.sum()
+        empty = masked_l1(alpha, torch.zeros_like(alpha), frame.empty, area)
+        solid = masked_l1(alpha, torch.ones_like(alpha), frame.weight, area)
+        return loss + weights.empty * empty + weights.solid * solid
 
     def _view_loss(self, canonical: Canonical, covars: Tensor, chosen: list[int]) -> Tensor:
         views, weights = self.views, self.config.weights
@@ -211,6 +221,15 @@ class _Run:
         mask = frame.weight[0] / frame.weight.max().clamp(min=1e-6)
         pair = input_view_pair(image, frame.target, mask)
         return psnr(*pair), ssim(*pair)
+
+
+@torch.no_grad()
+def _weigh_head(views: CanonicalViews, template: Template, factor: float) -> CanonicalViews:
+    """The canonical views with the weight of the head's pixels times `factor`."""
+    half = template.rotations * template.scales[:, None, :]
+    head = template.head[:, None].to(template.means).repeat(1, 3)
+    shown = render(template.means, half @ half.transpose(1, 2), template.opacities, head, views.cameras, background=0.0)
+    return replace(views, weight=views.weight * (1 + (factor - 1) * shown.images[:, :1]))
 
 
 def _schedule(progress: float) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import torch
 from pydantic import BaseModel, ConfigDict, Field
@@ -107,6 +108,12 @@ def dense_weights(indices: Tensor, weights: Tensor, n_joints: int) -> Tensor:
     return weights.new_zeros(len(weights), n_joints).scatter_add(1, indices, weights)
 
 
+@lru_cache(maxsize=2)
+def _canonical_pose(body: BodyModel) -> Tensor:
+    """The canonical pose of a body, which costs more to find than a frame's other transforms together."""
+    return canonical_pose(body)
+
+
 def relative_transforms(body: BodyModel, pose: Tensor, betas: Tensor, transl: Tensor) -> Tensor:
     """What takes the canonical body to a pose, joint by joint: T_j(pose) T_j(canonical)^-1.
 
@@ -119,9 +126,8 @@ def relative_transforms(body: BodyModel, pose: Tensor, betas: Tensor, transl: Te
     Returns:
         [B,J,4,4]; the identity where pose is the canonical pose and transl is 0.
     """
-    canonical = canonical_pose(body).to(pose)[None]
     shapes = betas.to(pose)[None]
-    start = body(canonical, shapes, torch.zeros_like(transl[:1])).transforms
+    start = body(_canonical_pose(body).to(pose)[None], shapes, torch.zeros_like(transl[:1])).transforms
     posed = body(pose, shapes.expand(len(pose), -1), transl).transforms
     rotation = start[:, :, :3, :3].transpose(-1, -2)
     shift = -(rotation @ start[:, :, :3, 3:])

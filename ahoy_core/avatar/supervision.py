@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn.functional import max_pool2d
 
 from ahoy_core.avatar.deform import relative_transforms
 from ahoy_core.avatar.losses import LossWeights, canonical_weight
@@ -17,6 +18,11 @@ from ahoy_core.metrics.regions import mask_box
 # A mask with less area than this (in pixels) says nothing about appearance.
 MIN_MASK_AREA = 16.0
 _MARGIN = 4
+# What is cut out goes this share of the picture's height further than the mask: there spikes can be seen and punished.
+_MARGIN_SHARE = 0.03
+# Alpha above which a mask speaks of a person, and the pixels around it that still may show one.
+_TRACE = 0.05
+_UNSURE = 2
 
 
 @dataclass(frozen=True)
@@ -30,6 +36,7 @@ class CoarseInputs:
         transl: [T,3] metres, world.
         frames: [T,3,H,W] sRGB, uint8 or float32 in [0,1].
         masks: [T,H,W] alpha of the visible part of the subject, uint8 or float32 in [0,1].
+        silhouettes: [T,H,W] alpha of the whole fitted body, hidden parts too, uint8 or float32 in [0,1].
         viewmat: [4,4] observed camera, world -> camera.
         K: [3,3] pixels of the frames.
         used: [T] bool, a person was fitted in the frame.
@@ -47,6 +54,7 @@ class CoarseInputs:
     transl: Tensor
     frames: Tensor
     masks: Tensor
+    silhouettes: Tensor
     viewmat: Tensor
     K: Tensor
     used: Tensor
@@ -59,13 +67,17 @@ class CoarseInputs:
 
     def __post_init__(self) -> None:
         count = len(self.frames)
-        for name in ("pose", "transl", "masks", "used", "confidence"):
+        for name in ("pose", "transl", "masks", "silhouettes", "used", "confidence"):
             if len(getattr(self, name)) != count:
                 raise ValueError(f"expected {count} rows of {name} (one a frame), got {len(getattr(self, name))}")
         if self.frames.ndim != 4 or self.frames.shape[1] != 3 or self.masks.shape[1:] != self.frames.shape[2:]:
             raise ValueError(
                 "expected frames [T,3,H,W] and masks [T,H,W] of one size, got "
                 f"{tuple(self.frames.shape)} and {tuple(self.masks.shape)}; channel-first in the core"
+            )
+        if self.silhouettes.shape != self.masks.shape:
+            raise ValueError(
+                f"expected silhouettes as the masks, {tuple(self.masks.shape)}, got {tuple(self.silhouettes.shape)}"
             )
         cameras = self.view_cameras
         size = (len(cameras), 4, cameras.height, cameras.width)
@@ -84,6 +96,7 @@ class Frame:
         number: Index into the ingested frames.
         target: [3,h,w] sRGB in [0,1].
         weight: [1,h,w] alpha of the visible person times the frame's confidence.
+        empty: [1,h,w] confidence where there is surely nobody: away from both the visible person and the fitted body.
         camera: The observed camera, cut to the box.
         relative: [J,4,4] canonical -> posed, joint by joint.
     """
@@ -91,6 +104,7 @@ class Frame:
     number: int
     target: Tensor
     weight: Tensor
+    empty: Tensor
     camera: Cameras
     relative: Tensor
 
@@ -150,7 +164,9 @@ def _ranges(numbers: Sequence[int]) -> str:
 
 def _cut(inputs: CoarseInputs, number: int, relative: Tensor) -> Frame:
     mask = unit_range(inputs.masks[number]).clamp(0, 1)
-    x0, y0, x1, y1 = mask_box(mask, _MARGIN)
+    x0, y0, x1, y1 = mask_box(mask, _MARGIN + round(_MARGIN_SHARE * mask.shape[0]))
+    near = (mask > _TRACE) | (unit_range(inputs.silhouettes[number]) > _TRACE)
+    around = max_pool2d(near[None].float(), 2 * _UNSURE + 1, stride=1, padding=_UNSURE)
     K = inputs.K.float().clone()
     K[0, 2] -= x0
     K[1, 2] -= y0
@@ -158,6 +174,7 @@ def _cut(inputs: CoarseInputs, number: int, relative: Tensor) -> Frame:
         number=number,
         target=unit_range(inputs.frames[number])[:, y0:y1, x0:x1],
         weight=mask[None, y0:y1, x0:x1] * float(inputs.confidence[number]),
+        empty=(1 - around[:, y0:y1, x0:x1]) * float(inputs.confidence[number]),
         camera=Cameras(inputs.viewmat.float()[None], K[None], x1 - x0, y1 - y0, "pinhole"),
         relative=relative,
     )

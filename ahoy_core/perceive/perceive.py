@@ -191,7 +191,7 @@ def _observations(
         # Visible landmarks score above .9 and hidden ones .4 to .8: the fourth power tells them apart.
         weights=torch.from_numpy(track.visibility[found]) ** 4,
         world=torch.from_numpy(track.world[found]) @ to_world,
-        times=torch.from_numpy(pts[found].astype(np.float32) - np.float32(pts[0])),
+        times=torch.from_numpy((pts[found] - pts[0]).astype(np.float64)),
         shot=torch.from_numpy(shots[found].astype(np.int64)),
         K=torch.from_numpy(K.astype(np.float32)),
     )

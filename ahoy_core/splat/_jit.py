@@ -19,7 +19,7 @@ kernel: Final[Callable[[Any], Any]] = functools.partial(numba.njit, nogil=True, 
 inlined: Final[Callable[[Any], Any]] = functools.partial(
     numba.njit, nogil=True, cache=True, error_model="numpy", forceinline=True
 )
-"""Of helpers that hand vectors to each other: a call would push sixteen lanes through memory."""
+"""Of functions that hand vectors to each other: a call would push sixteen lanes through memory."""
 
 intrinsic: Final[Callable[[Any], Any]] = _intrinsic
 """Decorator of what is written directly in LLVM's language."""

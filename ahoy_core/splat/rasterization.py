@@ -182,7 +182,7 @@ class _Meta(dict[str, Any]):
 
     def get(self, key: str, default: Any = None) -> Any:
         """Value of a key, made if need be."""
-        return self[key] if key in self else default
+        return self[key] if key in self else default  # noqa: SIM401
 
 
 def _conics(factors: Tensor) -> Tensor:

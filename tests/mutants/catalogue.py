@@ -174,8 +174,8 @@ BLENDING = (
     Mutant(
         "reach of three sigma whatever the opacity",
         BINNING,
-        "limit = (float(records[slot, 7]) - log2_cutoff) * (1.0 + SLACK) + SLACK",
-        "limit = min(float(records[slot, 7]) - log2_cutoff, 6.49) * (1.0 + SLACK) + SLACK",
+        "limit = maximum(load(scratch, 5 * LANES) - log2_cutoff, 0.0) *",
+        "limit = minimum(maximum(load(scratch, 5 * LANES) - log2_cutoff, 0.0), 6.49) *",
         (LAYERS + "an_opaque_gaussian_reaches_as_far_as_the_cutoff_says",),
     ),
     Mutant(
@@ -227,8 +227,8 @@ IMAGES = (
     Mutant(
         "background forgotten",
         BLEND,
-        "image[row, column, k] = state[base + (k + 2) * LANES + lane] + rest * background[k]",
-        "image[row, column, k] = state[base + (k + 2) * LANES + lane]",
+        "channel_blend(behind, rest, state, block * stride + 2 * LANES)",
+        "channel_blend(behind, rest - rest, state, block * stride + 2 * LANES)",
         (
             SIZES + "empty_input_is_background_with_gradients_of_the_right_shape",
             SIZES + "nothing_in_view_is_background_with_zero_gradients",
@@ -237,8 +237,8 @@ IMAGES = (
     Mutant(
         "blocks across the right border skipped",
         BLEND,
-        "if left < width and top < height:",
-        "if left + 3 < width and top < height:",
+        "if columns > 0 and rows > 0:",
+        "if columns > 3 and rows > 0:",
         (SIZES + "any_image_size_matches_the_oracle",),
     ),
     Mutant(

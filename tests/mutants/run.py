@@ -17,6 +17,7 @@ import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from itertools import chain
 from pathlib import Path
 
@@ -38,10 +39,10 @@ class Outcome:
     problem: str
 
 
-def copy_project(folder: Path) -> None:
+def copy_project(root: Path, folder: Path) -> None:
     """Copy what the tests need, so that the working tree is never touched."""
     for name in COPIED:
-        source, target = ROOT / name, folder / name
+        source, target = root / name, folder / name
         target.parent.mkdir(parents=True, exist_ok=True)
         if source.is_dir():
             shutil.copytree(source, target, ignore=shutil.ignore_patterns("__pycache__", "*.nbc", "*.nbi"))
@@ -81,11 +82,11 @@ def failed_tests(folder: Path, tests: Sequence[str]) -> tuple[set[str], str]:
     return failed, done.stdout
 
 
-def judge(mutant: Mutant) -> Outcome:
-    """Apply one mutant and run its tests."""
+def judge(snapshot: Path, mutant: Mutant) -> Outcome:
+    """Apply one mutant to a copy of the snapshot and run its tests."""
     with tempfile.TemporaryDirectory(prefix="mutant-") as name:
         folder = Path(name)
-        copy_project(folder)
+        copy_project(snapshot, folder)
         if problem := patch(folder, mutant):
             return Outcome(mutant.name, problem)
         failed, output = failed_tests(folder, mutant.tests)
@@ -94,11 +95,11 @@ def judge(mutant: Mutant) -> Outcome:
         return Outcome(mutant.name, problem)
 
 
-def baseline(mutants: Sequence[Mutant]) -> Outcome:
+def baseline(snapshot: Path, mutants: Sequence[Mutant]) -> Outcome:
     """The tests must pass on the code as it is, or their failure proves nothing."""
     with tempfile.TemporaryDirectory(prefix="mutant-") as name:
         folder = Path(name)
-        copy_project(folder)
+        copy_project(snapshot, folder)
         failed, output = failed_tests(folder, [test for mutant in mutants for test in mutant.tests])
         broken = bool(failed) or not re.search(r"\d+ passed", output)
         return Outcome("(no mutant)", f"the tests fail without any mutant\n{output[-3000:]}" if broken else "")
@@ -114,8 +115,10 @@ def main() -> int:
     if unknown := set(arguments.names) - {mutant.name for mutant in chosen}:
         parser.error(f"expected names of the catalogue, got {sorted(unknown)}: see tests/mutants/catalogue.py")
     problems = 0
-    with ThreadPoolExecutor(arguments.jobs) as pool:
-        for outcome in chain([baseline(chosen)], pool.map(judge, chosen)):
+    with tempfile.TemporaryDirectory(prefix="mutants-") as name, ThreadPoolExecutor(arguments.jobs) as pool:
+        snapshot = Path(name)
+        copy_project(ROOT, snapshot)
+        for outcome in chain([baseline(snapshot, chosen)], pool.map(partial(judge, snapshot), chosen)):
             print(f"{'PROBLEM' if outcome.problem else 'caught':8} {outcome.name}  {outcome.problem}", flush=True)
             problems += bool(outcome.problem)
     print(f"{len(chosen)} mutants, {problems} problems")
