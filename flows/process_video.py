@@ -6,10 +6,12 @@ The store, not Prefect, knows what is done: tasks keep no results and no cache, 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
+from prefect.runtime import flow_run
 
 from flows.deliver import deliver
 from flows.pipeline import process
@@ -31,7 +33,13 @@ def call_as_task(stage: Stage, settings: Settings, inputs: Mapping[str, StageRef
     return StageRef.from_json(as_task(body)())
 
 
-@flow(name="process-video", flow_run_name="{request.video}", persist_result=False, log_prints=False)
+def _run_name() -> str:
+    """The video's file name: what a person looks for in a list of runs."""
+    request: Any = flow_run.parameters["request"]
+    return Path(request["video"] if isinstance(request, dict) else request.video).name
+
+
+@flow(name="process-video", flow_run_name=_run_name, persist_result=False, log_prints=False)
 def process_video(request: VideoRequest) -> dict[str, str]:
     """Turn one video into an avatar; returns the paths of what it made."""
     source = request.source()

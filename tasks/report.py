@@ -34,10 +34,20 @@ SECTIONS = {
     ),
     "texture": (
         "Texture and coverage",
-        "Left: what the video shows (first write wins). Middle: coverage. Right: completed.",
+        "What the video shows of the surface, and what was made up from it.",
     ),
     "coarse": ("Training", "Loss by step, and observed frames beside the avatar in their pose."),
     "animate": ("From every side", "Eight views of the avatar."),
+}
+
+
+CAPTIONS = {
+    ("perceive", "overlay.png"): "left of each pair the mask and the landmarks, right the fitted body",
+    ("texture", "atlas.png"): "texture of the body's surface: observed (first write wins), coverage, completed",
+    ("texture", "canonical.png"): "the canonical pose: observed texels only, and the completed body from four sides",
+    ("coarse", "compare.png"): "frames of the video beside the whole avatar in the same pose, hidden parts included",
+    ("coarse", "losses.png"): "terms of the objective by step, and the score of a frame held out of training",
+    ("animate", "turntable.png"): "eight views of the avatar",
 }
 
 

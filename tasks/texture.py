@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from ahoy_core.texture.texture import Texture, TextureConfig, build_texture
 from tasks.roles import ours, packaged_body
 from tasks.stage import Role, Stage, StageContext, StageOutput
 
+SHOWN = 5  # rejected frames named in the report
 GREY = 128  # canonical views are shown over the grey that everything else is composited on
 
 
@@ -28,7 +30,26 @@ def run_texture(config: TextureConfig, ctx: StageContext) -> StageOutput:
     save_npz(ctx.out / "canonical.npz", texture.canonical_arrays(), compress=True)
     (ctx.out / "texture.json").write_text(json.dumps(texture.notes, indent=1), encoding="utf-8")
     _pictures(texture, ctx)
-    return StageOutput(summary={"facts": texture.notes}, pictures=("atlas.png", "canonical.png"))
+    return StageOutput(_summary(texture, len(frames)), pictures=("atlas.png", "canonical.png"))
+
+
+def _summary(texture: Texture, total: int) -> dict[str, Any]:
+    """The readable part of the notes; all of them are in texture.json."""
+    notes = texture.notes
+    facts = {
+        "seen in the video": f"{notes['observed_share']:.0%} of the surface",
+        "copied from the other side": f"{notes['mirrored_share']:.0%}",
+        "blended in": f"{notes['diffused_share']:.0%}",
+        "fill": notes["fill"],
+        "frames that wrote": f"{len(notes['frames_used'])} of {total}",
+    }
+    rejected = [f"frame {frame} not used: {why}" for frame, why in list(notes["frames_rejected"].items())[:SHOWN]]
+    more = len(notes["frames_rejected"]) - len(rejected)
+    return {
+        "facts": facts,
+        "notes": [*rejected, *([f"and {more} more frames, see texture.json"] if more else [])],
+        "observed_share": notes["observed_share"],
+    }
 
 
 def _pictures(texture: Texture, ctx: StageContext) -> None:

@@ -29,7 +29,7 @@ IN_CHANNELS_PER_SIDE = 7
 _SPREAD = 0.7
 # Disks on a surface seen at a glancing angle are stretched by 1/cos, at most this much: beyond it another view has
 # samples.
-_MAX_STRETCH = 2.5
+_MAX_STRETCH = 1.5
 _THICKNESS = 0.15
 _OPACITY = 0.98
 _SURFACE_SAMPLES = 40_000

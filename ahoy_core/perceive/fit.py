@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ahoy_core.body.model import BodyModel
 from ahoy_core.body.rotations import matrix_to_axis_angle
+from ahoy_core.perceive.edges import find_edges, make_skin
 from ahoy_core.perceive.lift import root_rotations, translations
 from ahoy_core.perceive.normal import solve
 from ahoy_core.perceive.objective import FitConfig, Objective, assemble, costs, pose_weights
@@ -19,6 +22,7 @@ from ahoy_core.perceive.residuals import MIN_DEPTH, Observations, differences, i
 from ahoy_core.perceive.state import State, linearise
 
 SCALES = (0.5, 0.25, 0.1)  # metres: widths of Geman-McClure on the image, one after the other
+OUTLINE_ROUNDS = 2  # edges are looked for anew in each
 FIRST_DAMPING = 1e-2
 MAX_DAMPING = 1e6  # a step this damped does not move: the cost is as low as it gets
 ENOUGH = 1e-4  # share of the cost below which a step's gain ends a stage
@@ -53,34 +57,40 @@ def fit_body(
     seen: Observations,
     config: FitConfig,
     progress: Callable[[int, int, str], None] | None = None,
+    masks: NDArray[np.uint8] | None = None,
 ) -> Fit:
     """Fit one shape and N poses.
 
     First joints follow the network's 3D (any facing is a good start), then a linear solve places the body, then
-    everything follows the image under an annealed Geman-McClure cost.
+    everything follows the image under an annealed Geman-McClure cost, at last with the body's outline against the
+    masks'.
 
     Args:
         body: any body whose joints `priors.RULES` know.
         seen: the observations, frames of a person only.
         config: the knobs.
         progress: called with steps done and in total.
+        masks: [N,H,W] uint8, the visible person, edges at `masks.EDGE`; None leaves outlines out.
 
     Raises:
-        ValueError: there are no frames.
+        ValueError: there are no frames, or another number of masks.
     """
     if len(seen.points) == 0:
         raise ValueError("expected at least one frame with landmarks, got none")
+    if masks is not None and len(masks) != len(seen.points):
+        raise ValueError(f"expected one mask for each of {len(seen.points)} frames, got {len(masks)}")
     seen = replace(seen, **{k: getattr(seen, k).double() for k in ("points", "weights", "world", "times", "K")})
     betas = body.default_betas.double()
     prior = build_prior(body, betas)
     reduced = reduce_body(body, prior.free, betas)
     objective = Objective(prior, pose_weights(reduced, seen, config), seen, differences(seen), betas, config)
-    total = config.iterations * (1 + len(SCALES))
+    rounds = OUTLINE_ROUNDS if masks is not None and masks.any() and config.outline > 0 else 0
+    total = config.iterations * (1 + len(SCALES) + rounds)
 
-    def stage(state: State, number: int, scale: float | None) -> State:
+    def stage(state: State, number: int, scale: float | None, goal: Objective = objective) -> State:
         start = config.iterations * number
         report = progress or (lambda done, total, note: None)
-        return _descend(objective, reduced, state, scale, lambda i: report(start + i, total, "fitting the body"))
+        return _descend(goal, reduced, state, scale, lambda i: report(start + i, total, "fitting the body"))
 
     state = stage(_start(objective, reduced), 0, None)
     state = replace(state, place=_place(reduced, state, seen))
@@ -88,7 +98,13 @@ def fit_body(
         state = stage(state, i + 1, scale)
         # The shape model is linear round a point, so it is rebuilt where the shape has got to.
         reduced = reshape(reduced, body, state.betas)
-    return _finish(objective, reduced, state, body)
+    goal = objective
+    for i in range(rounds):
+        assert masks is not None
+        edges = find_edges(reduced, make_skin(body, reduced), state, masks, seen.weights, seen.K)
+        goal = replace(objective, outline=edges)
+        state = stage(state, 1 + len(SCALES) + i, SCALES[-1], goal)
+    return _finish(goal, reduced, state, body)
 
 
 def _start(objective: Objective, reduced: ReducedBody) -> State:

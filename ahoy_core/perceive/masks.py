@@ -8,14 +8,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ahoy_core.perceive.fill import fill_triangles
 from ahoy_core.perceive.guided import guided_filter
 
 CELLS = 256  # across the network's mask
 GUIDE_CELLS = 2  # how far an edge may move to meet an edge of the picture: the mask knows no better than this
 GUIDE_EPS = 1e-3  # colour variance (RGB in [0,1]) below which a patch counts as flat
 SOFT_LOW, SOFT_HIGH = 0.2, 0.85  # mask values that become 0 and 1: the network's edge is wider than the picture's
+EDGE = 0.5 * (SOFT_LOW + SOFT_HIGH) * 255  # of 255: the soft mask's value where the alpha is a half
 REACH = 0.12  # of the body's height: what lies farther from the fitted body is not this person
 SUPERSAMPLING = 2
+MIN_DEPTH = 1e-3  # metres: nearer points count as behind the camera
 VISIBLE = 127  # of 255: more than half
 
 
@@ -98,23 +101,30 @@ def silhouette(
     Returns:
         [height,width] coverage, 0 to 255. Triangles that reach behind the camera are left out.
     """
-    scale, shift = SUPERSAMPLING, 4
-    depth = vertices[:, 1]
-    in_front = depth > 1e-3
-    safe = np.where(in_front, depth, 1.0)
-    x = (vertices[:, 0] / safe * K[0, 0] + K[0, 2]) * scale - 0.5
-    y = (-vertices[:, 2] / safe * K[1, 1] + K[1, 2]) * scale - 0.5
-    fine = np.zeros((height * scale, width * scale), np.uint8)
-    # Far outside of the picture a coordinate would overflow OpenCV's fixed point; the clamp keeps triangles outside.
-    limit = 4.0 * scale * max(height, width)
-    points = np.round(np.clip(np.stack([x, y], axis=1), -limit, limit) * (1 << shift)).astype(np.int32)
-    corners = points[faces[in_front[faces].all(axis=1)]].astype(np.int64)
-    a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    # Pictures have y down, so outward triangles (counter-clockwise seen from outside) turn the other way round here.
-    facing = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0] < 0
-    for triangle in corners[facing].astype(np.int32):
-        cv2.fillConvexPoly(fine, triangle, 255, lineType=cv2.LINE_8, shift=shift)
+    points, in_front = project_points(vertices, K)
+    facing = faces_camera(points, faces) & in_front[faces].all(axis=1)
+    fine = np.zeros((height * SUPERSAMPLING, width * SUPERSAMPLING), np.uint8)
+    fill_triangles(fine, points * SUPERSAMPLING, faces[facing])
     return np.asarray(cv2.resize(fine, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+def project_points(
+    vertices: NDArray[np.floating], K: NDArray[np.floating]
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Pixels [V,2] of points [V,3] seen by `OBSERVED_VIEWMAT`, and whether each is in front of the camera."""
+    depth = vertices[:, 1].astype(np.float64)
+    in_front = depth > MIN_DEPTH
+    safe = np.where(in_front, depth, 1.0)
+    across = vertices[:, 0] / safe * K[0, 0] + K[0, 2]
+    return np.stack([across, -vertices[:, 2] / safe * K[1, 1] + K[1, 2]], axis=1), in_front
+
+
+def faces_camera(points: NDArray[np.float64], faces: NDArray[np.integer]) -> NDArray[np.bool_]:
+    """Whether each triangle [F] shows its outside, from its corners' pixels [V,2]."""
+    corner = points[faces[:, 0]]
+    a, b = points[faces[:, 1]] - corner, points[faces[:, 2]] - corner
+    # Pictures have y down, so outward triangles (counter-clockwise seen from outside) turn the other way round here.
+    return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0] < 0)
 
 
 def mask_box(mask: NDArray[np.uint8]) -> NDArray[np.float32]:

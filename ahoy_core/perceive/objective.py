@@ -8,6 +8,13 @@ import torch
 from torch import Tensor
 
 from ahoy_core.perceive.normal import Normal, add_rows, empty_normal
+from ahoy_core.perceive.outline import (
+    OUTLINE_SCALE,
+    OUTLINE_SPREAD,
+    Outline,
+    outline_offsets,
+    outline_rows,
+)
 from ahoy_core.perceive.priors import PosePrior
 from ahoy_core.perceive.reduced import ReducedBody
 from ahoy_core.perceive.residuals import (
@@ -28,6 +35,9 @@ from ahoy_core.perceive.state import Linearised, State, below
 ACCELERATION_SPREAD = 8.0  # m/s^2 of a joint in everyday movement
 DEPTH_SPEED = 0.5  # m/s along the line of sight: what the image hardly shows is held still
 SHAPE_SPREAD = 0.02  # metres, root mean square over the surface, that one shape parameter departs from the average
+# Adults born in 1996, worldwide: women 1.59 m, men 1.71 m on average (NCD Risk Factor Collaboration, eLife 2016), with
+# some 7 cm of spread in each; together a mean of 1.65 and a spread of 0.09.
+STATURE, STATURE_SPREAD = 1.65, 0.09
 SCALE_SPREAD = 0.1  # of the logarithm of the network's metre
 WORLD_SCALE = 0.4  # metres: width of Geman-McClure on the network's 3D
 SEEN_SHARE = 0.05  # of the pose prior that stays on joints that move a visible landmark
@@ -45,6 +55,7 @@ class FitConfig:
             ones lag.
         pose_prior: weight of the pose prior on joints of which nothing is seen; `SEEN_SHARE` of it on the others.
         world_weight: weight of the network's own 3D against the image.
+        outline: weight of the masks' outlines; 0 leaves them out.
         beta_range: bounds of every shape parameter; None for a body whose parameters are unbounded.
     """
 
@@ -52,6 +63,7 @@ class FitConfig:
     smoothing: float = 1.0
     pose_prior: float = 3.0
     world_weight: float = 1.0
+    outline: float = 1.0
     beta_range: tuple[float, float] | None = (0.0, 1.0)
 
 
@@ -64,8 +76,9 @@ class Objective:
         pose_weights: [N,F-1] of the pose prior, see `pose_weights`.
         seen: the observations.
         steps: differences in time.
-        average: [S] shape that the prior tends to.
+        average: [S] shape that the prior tends to, size apart.
         config: the knobs.
+        outline: places of the body's outline and where the masks end, if they are to agree.
     """
 
     prior: PosePrior
@@ -74,6 +87,7 @@ class Objective:
     steps: Differences
     average: Tensor
     config: FitConfig
+    outline: Outline | None = None
 
 
 def pose_weights(reduced: ReducedBody, seen: Observations, config: FitConfig) -> Tensor:
@@ -101,6 +115,7 @@ def costs(
     landmarks, joints = state.posed(reduced)
     terms = {
         **_seen_terms(objective, landmarks, state, scale, person),
+        **_outline_terms(objective, reduced, state, person),
         **_prior_terms(objective, reduced, joints, state),
     }
     return {name: float(cost) for name, cost in terms.items()}
@@ -119,6 +134,16 @@ def _seen_terms(
     return terms
 
 
+def _outline_terms(
+    objective: Objective, reduced: ReducedBody, state: State, person: Tensor
+) -> dict[str, Tensor]:
+    if objective.outline is None:
+        return {}
+    offsets = outline_offsets(reduced, state, objective.outline, objective.seen.K, person)
+    robust = geman_mcclure(offsets.square(), OUTLINE_SCALE)
+    return {"outline": objective.config.outline * (objective.outline.weights * robust).sum() / OUTLINE_SPREAD**2}
+
+
 def _prior_terms(objective: Objective, reduced: ReducedBody, joints: Tensor, state: State) -> dict[str, Tensor]:
     steps, config, prior = objective.steps, objective.config, objective.prior
     bend = apply_differences(joints, steps.bend_first, steps.bend)
@@ -132,6 +157,7 @@ def _prior_terms(objective: Objective, reduced: ReducedBody, joints: Tensor, sta
         "depth": speed.square().sum() / DEPTH_SPEED**2,
         "shape": _shape_weights(reduced, objective) @ (state.betas - objective.average).square()
         + len(joints) * (state.log_scale / SCALE_SPREAD) ** 2,
+        "stature": len(joints) * ((reduced.shaped_stature(state.betas) - STATURE) / STATURE_SPREAD) ** 2,
     }
 
 
@@ -152,12 +178,14 @@ def assemble(
     n, f = state.angles.shape[:2]
     normal = empty_normal(n, 3 * f + 3, len(state.betas) + 1)
     _add_seen(normal, objective, state, linear, scale, person)
+    _add_outline(normal, objective, reduced, state, person)
     _add_temporal(normal, objective, state, linear)
     _add_angles(normal, objective, state)
     weights = _shape_weights(reduced, objective)
     weights = torch.cat([weights, weights.new_tensor([n / SCALE_SPREAD**2])])
     normal.corner.diagonal().add_(weights)
     normal.clip_gradient.add_(weights * torch.cat([state.betas - objective.average, state.log_scale[None]]))
+    _add_stature(normal, reduced, state)
     if scale is None:
         _freeze_place(normal, 3 * f)
     return normal
@@ -188,6 +216,26 @@ def _add_seen(
     weights = seen.weights * geman_mcclure_weight(offsets.square().sum(-1), scale)
     root = weights.sqrt()[..., None] / LANDMARK_SPREAD
     _add_rows(normal, root * offsets, root[..., None] * rows, per_frame)
+
+
+def _add_outline(
+    normal: Normal, objective: Objective, reduced: ReducedBody, state: State, person: Tensor
+) -> None:
+    outline = objective.outline
+    if outline is None:
+        return
+    offsets, rows = outline_rows(reduced, state, outline, objective.seen.K, person)
+    weights = objective.config.outline * outline.weights * geman_mcclure_weight(offsets.square(), OUTLINE_SCALE)
+    root = weights.sqrt() / OUTLINE_SPREAD
+    per_frame = normal.gradient.shape[1]
+    _add_rows(normal, (root * offsets)[..., None], (root[..., None] * rows)[:, :, None], per_frame)
+
+
+def _add_stature(normal: Normal, reduced: ReducedBody, state: State) -> None:
+    row = torch.cat([reduced.stature_slopes, reduced.stature_slopes.new_zeros(1)]) / STATURE_SPREAD
+    n = len(normal.gradient)
+    normal.corner.add_(n * torch.outer(row, row))
+    normal.clip_gradient.add_(n * row * (reduced.shaped_stature(state.betas) - STATURE) / STATURE_SPREAD)
 
 
 def _add_temporal(normal: Normal, objective: Objective, state: State, linear: Linearised) -> None:

@@ -27,9 +27,9 @@ from ahoy_core.perceive.tracking import NoPersonError
 __all__ = ["NoPersonError", "PerceiveConfig", "Perception", "assumed_intrinsics", "perceive"]
 
 Progress = Callable[[int, int, str], None]
-# Shares of the stage's time, for one progress bar over its three parts; in thousandths.
+# Shares of the stage's time, for one progress bar over its parts; in thousandths.
 BAR = 1000
-BAR_LANDMARKS, BAR_FIT = 500, 800
+BAR_LANDMARKS, BAR_MASKS, BAR_FIT = 500, 600, 900
 
 
 class PerceiveConfig(BaseModel):
@@ -44,6 +44,7 @@ class PerceiveConfig(BaseModel):
         iterations: most steps in each of the fit's four stages; it stops earlier when nothing is gained.
         smoothing: weight of accelerations in the fit.
         fov_degrees: diagonal field of view assumed where no camera is given.
+        outline: weight of the masks' outlines in the fit; 0: landmarks alone.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -55,6 +56,7 @@ class PerceiveConfig(BaseModel):
     iterations: int = Field(default=10, ge=1, le=1000)
     smoothing: float = Field(default=1.0, ge=0.0, le=1000.0)
     fov_degrees: float = Field(default=50.0, gt=5.0, lt=150.0)
+    outline: float = Field(default=1.0, ge=0.0, le=1000.0)
 
 
 @dataclass(frozen=True)
@@ -140,27 +142,28 @@ def perceive(
             "use a clip in which a person is larger or better lit"
         )
     intrinsics = assumed_intrinsics(height, width, config.fov_degrees) if K is None else np.asarray(K, np.float64)
-    fit = fit_body(
-        body,
-        _observations(track, pts[looked], shots[looked], intrinsics),
-        FitConfig(iterations=config.iterations, smoothing=config.smoothing),
-        lambda done, total, note: report(BAR_LANDMARKS + (BAR_FIT - BAR_LANDMARKS) * done // total, BAR, note),
-    )
     used = np.zeros(n, np.bool_)
     used[looked[track.found]] = True
-    pose, transl = spread_poses(fit.pose, fit.transl, used, pts, shots)
     soft = np.zeros((n, height, width), np.uint8)
-    masks = []
     for row, t in enumerate(looked.tolist()):
         roi = track.rois[row]
         if roi is not None:
             soft[t] = refine(frames[t], track.mask(row, height, width), roi.size)
-        report(BAR_FIT + (BAR - BAR_FIT) // 2 * (row + 1) // len(looked), BAR, "cutting the person out")
+        report(BAR_LANDMARKS + (BAR_MASKS - BAR_LANDMARKS) * (row + 1) // len(looked), BAR, "cutting the person out")
     soft[used] = hold_static(frames[used], soft[used], shots[used])
+    fit = fit_body(
+        body,
+        _observations(track, pts[looked], shots[looked], intrinsics),
+        FitConfig(iterations=config.iterations, smoothing=config.smoothing, outline=config.outline),
+        lambda done, total, note: report(BAR_MASKS + (BAR_FIT - BAR_MASKS) * done // total, BAR, note),
+        soft[used],
+    )
+    pose, transl = spread_poses(fit.pose, fit.transl, used, pts, shots)
+    masks = []
     for t in range(n):
         amodal = _amodal(body, pose[t], transl[t], fit.betas, intrinsics, height, width)
         masks.append(frame_masks(soft[t], amodal))
-        report((BAR_FIT + BAR) // 2 + (BAR - BAR_FIT) // 2 * (t + 1) // n, BAR, "drawing the silhouettes")
+        report(BAR_FIT + (BAR - BAR_FIT) * (t + 1) // n, BAR, "drawing the silhouettes")
     notes = _notes(config, track, fit, used, masks, intrinsics, (height, width), K is not None)
     return _assemble(body, track, fit, used, looked, pose, transl, masks, intrinsics, notes)
 

@@ -21,6 +21,11 @@ SHAPE_STEP = (
     0.02  # of a finite difference in betas: large enough for float32, small enough for a shape space with bends
 )
 
+_SHAPED = (
+    "base_betas", "moments", "joints", "moment_slopes", "joint_slopes",
+    "surface", "surface_slopes", "stature", "stature_slopes", "reach",
+)  # fmt: skip
+
 
 @dataclass(frozen=True)
 class ReducedBody:
@@ -34,7 +39,13 @@ class ReducedBody:
         joints: [F,3] rest positions at `base_betas`.
         moment_slopes: [S,33,F,4], per unit of each beta.
         joint_slopes: [S,F,3].
-        reach: [S] metres, root mean square over the surface, per unit of each beta.
+        surface: [V,3] rest vertices at `base_betas`.
+        surface_slopes: [S,V,3].
+        skin: [V,F] skinning weights, those of resting joints folded into the joint that carries them.
+        stature: metres from the lowest to the highest point at `base_betas`.
+        stature_slopes: [S].
+        reach: [S] metres, root mean square over the surface, per unit of each beta: what it does besides making the
+            whole body larger or smaller.
     """
 
     free: tuple[int, ...]
@@ -44,6 +55,11 @@ class ReducedBody:
     joints: Tensor
     moment_slopes: Tensor
     joint_slopes: Tensor
+    surface: Tensor
+    surface_slopes: Tensor
+    skin: Tensor
+    stature: Tensor
+    stature_slopes: Tensor
     reach: Tensor
 
     def __call__(self, rotations: Tensor, transl: Tensor, betas: Tensor) -> tuple[Tensor, Tensor]:
@@ -71,6 +87,14 @@ class ReducedBody:
         """Moments [33,F,4] for a shape [S]."""
         return self.moments + torch.einsum("s,skfc->kfc", betas - self.base_betas, self.moment_slopes)
 
+    def shaped_surface(self, betas: Tensor) -> Tensor:
+        """Rest vertices [V,3] for a shape [S]."""
+        return self.surface + torch.einsum("s,svc->vc", betas - self.base_betas, self.surface_slopes)
+
+    def shaped_stature(self, betas: Tensor) -> Tensor:
+        """Stature [] in metres for a shape [S]."""
+        return self.stature + self.stature_slopes @ (betas - self.base_betas)
+
     def expand(self, axis_angle: Tensor, n_joints: int) -> Tensor:
         """Spread [T,F,3] over all joints of the body, [T,J,3]; the others rest."""
         pose = axis_angle.new_zeros(len(axis_angle), n_joints, 3)
@@ -96,7 +120,10 @@ def reduce_body(body: BodyModel, free: Sequence[int], betas: Tensor) -> ReducedB
     carrier = _carriers(body.parents, row)
     parents = tuple(-1 if j == 0 else carrier[body.parents[j]] for j in chosen)
     empty = betas.new_zeros(0)
-    return reshape(ReducedBody(chosen, parents, betas, empty, empty, empty, empty, empty), body, betas)
+    carriers = torch.tensor([carrier[joint] for joint in range(len(body.parents))])
+    skin = betas.new_zeros(len(body.lbs_weights), len(chosen)).index_add_(1, carriers, body.lbs_weights.to(betas))
+    unshaped = ReducedBody(chosen, parents, skin=skin, **dict.fromkeys(_SHAPED, empty))
+    return reshape(unshaped, body, betas)
 
 
 def reshape(reduced: ReducedBody, body: BodyModel, betas: Tensor) -> ReducedBody:
@@ -104,20 +131,19 @@ def reshape(reduced: ReducedBody, body: BodyModel, betas: Tensor) -> ReducedBody
     n = len(betas)
     step = SHAPE_STEP * torch.eye(n).to(betas)
     steps = torch.cat([torch.zeros_like(betas)[None], step, -step])
-    carrier = torch.tensor(_carriers(body.parents, {joint: i for i, joint in enumerate(reduced.free)}))
     support, place = body.landmark_indices.unique(return_inverse=True)
     weights = betas.new_zeros(len(place), len(support)).scatter_add_(1, place, body.landmark_weights.to(betas))
-    skin = betas.new_zeros(len(support), len(reduced.free)).index_add_(1, carrier, body.lbs_weights[support].to(betas))
     like = body.default_betas
     moments, joints, surfaces = [], [], []
     with torch.no_grad():
         for shape in (betas + steps).to(like):
             out = body(like.new_zeros(1, body.n_joints, 3), shape[None], like.new_zeros(1, 3))
-            moments.append(_moments(weights, skin, out.rest_vertices[0, support].to(betas)))
+            moments.append(_moments(weights, reduced.skin[support], out.rest_vertices[0, support].to(betas)))
             surfaces.append(out.rest_vertices[0].to(betas))
             joints.append(out.rest_joints[0, list(reduced.free)].to(betas))
     m, j, surface = torch.stack(moments), torch.stack(joints), torch.stack(surfaces)
-    spread = (surface[1 : n + 1] - surface[n + 1 :]) / (2 * SHAPE_STEP)
+    slopes = (surface[1 : n + 1] - surface[n + 1 :]) / (2 * SHAPE_STEP)
+    height = surface[..., 2].amax(1) - surface[..., 2].amin(1)
     return replace(
         reduced,
         base_betas=betas.detach().clone(),
@@ -125,8 +151,19 @@ def reshape(reduced: ReducedBody, body: BodyModel, betas: Tensor) -> ReducedBody
         joints=j[0],
         moment_slopes=(m[1 : n + 1] - m[n + 1 :]) / (2 * SHAPE_STEP),
         joint_slopes=(j[1 : n + 1] - j[n + 1 :]) / (2 * SHAPE_STEP),
-        reach=spread.square().sum(-1).mean(-1).sqrt(),
+        surface=surface[0],
+        surface_slopes=slopes,
+        stature=height[0],
+        stature_slopes=(height[1 : n + 1] - height[n + 1 :]) / (2 * SHAPE_STEP),
+        reach=_besides_size(surface[0], slopes),
     )
+
+
+def _besides_size(surface: Tensor, slopes: Tensor) -> Tensor:
+    """Root mean square [S] of slopes [S,V,3] after the best shift and uniform growth of the surface [V,3] are off."""
+    centred, moved = surface - surface.mean(0), slopes - slopes.mean(1, keepdim=True)
+    growth = (moved * centred).sum((1, 2)) / centred.square().sum()
+    return (moved - growth[:, None, None] * centred).square().sum(-1).mean(-1).sqrt()
 
 
 def _carriers(parents: Sequence[int], row: dict[int, int]) -> list[int]:

@@ -124,13 +124,21 @@ def _columns(lever: Tensor, turning: Tensor, by_shape: Tensor) -> Tensor:
 def _by_shape(reduced: ReducedBody, rotations: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
     """Derivatives of landmarks [N,33,3,S] and joints [N,F,3,S] by betas with the root joint held: linear in them."""
     landmarks, joints = [], []
-    for moment, rest in zip(reduced.moment_slopes, reduced.joint_slopes, strict=True):
-        shift = -rest[:1].expand(len(rotations), -1)
-        moved = forward_kinematics(rotations, rest[None], reduced.parents, shift)[:, :, :3]
+    for moment, rest, moved in zip(
+        reduced.moment_slopes, reduced.joint_slopes, moved_by_shape(reduced, rotations), strict=True
+    ):
         joints.append((moved[..., :3] @ rest[..., None])[..., 0] + moved[..., 3])
         turned = torch.einsum("nfij,kfj->nki", moved[..., :3], moment[..., :3])
         landmarks.append(turned + torch.einsum("nfi,kf->nki", moved[..., 3], weights))
     return torch.stack(landmarks, -1), torch.stack(joints, -1)
+
+
+def moved_by_shape(reduced: ReducedBody, rotations: Tensor) -> list[Tensor]:
+    """Joints' transforms [N,F,3,4] of each beta's slope alone, the root joint held: posing is linear in betas."""
+    return [
+        forward_kinematics(rotations, rest[None], reduced.parents, -rest[:1].expand(len(rotations), -1))[:, :, :3]
+        for rest in reduced.joint_slopes
+    ]
 
 
 def below(parents: tuple[int, ...]) -> Tensor:

@@ -75,6 +75,7 @@ def coarse_inputs(count: int = 6, size: int = 48) -> CoarseInputs:
         transl=transl,
         frames=torch.stack(frames),
         masks=torch.stack(masks),
+        silhouettes=torch.stack(masks),
         viewmat=OBSERVED_VIEWMAT,
         K=K,
         used=torch.ones(count, dtype=torch.bool),

@@ -1,12 +1,15 @@
 from __future__ import annotations
 
+import math
 from functools import cache
 
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from ahoy_core.animate import contact_sheet, framing_cameras, motion_frames, render_views, to_uint8, turntable
+from ahoy_core.animate import FOV, evenly_chosen, framing_cameras, motion_frames, render_views, turntable
 from ahoy_core.avatar import Avatar, AvatarInfo
 from ahoy_core.avatar.avatar import bake, network_config
 from ahoy_core.avatar.deform import OffsetBounds, offset_channels
@@ -38,6 +41,32 @@ def test_the_turntable_shows_the_whole_person_from_every_side():
         rows = np.flatnonzero(person.any(1))
         assert 0.6 * SIZE < rows[-1] - rows[0] < SIZE - 1
         assert not person[:, [0, -1]].any()
+
+
+@pytest.mark.parametrize(("height", "width"), [(120, 90), (90, 120), (120, 40)])
+def test_the_person_fills_the_picture_in_the_direction_that_binds(height: int, width: int):
+    people = _person(turntable(_avatar(), body(), 8, height, width))
+    tall, wide = people.any(2).sum(1).max() / height, people.any(1).sum(1).max() / width
+    assert 0.8 <= max(tall, wide) <= 0.95
+    assert min(tall, wide) <= 0.95
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 10_000), n=st.integers(1, 9), stretch=st.floats(0.05, 20.0), height=st.integers(16, 400))
+def test_every_point_is_within_the_frame_and_one_is_at_its_border(seed: int, n: int, stretch: float, height: int):
+    points = torch.rand(50, 3, generator=torch.Generator().manual_seed(seed)) * torch.tensor([1.0, 1.0, stretch]) + 3
+    width = 200
+    cameras = framing_cameras(points, n, height, width)
+    seen = points @ cameras.viewmats[:, :3, :3].transpose(1, 2) + cameras.viewmats[:, None, :3, 3]
+    focal = height / (2 * math.tan(FOV / 2))
+    across, along = (seen[..., i].abs() / seen[..., 2] * focal for i in (0, 1))
+    share = torch.maximum(across / (width / 2), along / (height / 2))
+    assert (seen[..., 2] > 0).all()
+    assert float(share.max()) <= 0.9 + 1e-4
+    # Unless the picture is so wide that the camera would have to stand among the points.
+    middle, span = (points.amax(0) + points.amin(0)) / 2, (points.amax(0) - points.amin(0)).norm()
+    radius = float((cameras.viewmats[0, :3, :3] @ middle + cameras.viewmats[0, :3, 3])[2])
+    assert float(share.max()) >= 0.9 - 1e-3 or math.isclose(radius, float(span), rel_tol=1e-3)
 
 
 def test_front_and_back_have_one_outline_mirrored():
@@ -83,19 +112,9 @@ def test_motion_progress_counts_frames():
     assert seen == [(1, 2), (2, 2)]
 
 
-def test_a_contact_sheet_places_evenly_chosen_frames_in_reading_order():
+def test_frames_for_a_sheet_are_evenly_chosen_and_a_short_clip_repeats_some():
     frames = np.arange(16, dtype=np.uint8)[:, None, None, None] * np.ones((1, 2, 3, 3), dtype=np.uint8)
-    sheet = contact_sheet(frames)
-    assert sheet.shape == (4, 12, 3)
-    assert sheet[::2, ::3, 0].tolist() == [[0, 2, 4, 6], [8, 10, 12, 14]]
+    assert [int(frame[0, 0, 0]) for frame in evenly_chosen(frames)] == [0, 2, 4, 6, 8, 10, 12, 14]
+    assert [int(frame[0, 0, 0]) for frame in evenly_chosen(frames[:3], 6)] == [0, 0, 1, 1, 2, 2]
     with pytest.raises(ValueError, match="at least one frame"):
-        contact_sheet(frames[:0])
-
-
-def test_a_short_clip_repeats_frames_on_the_sheet():
-    assert contact_sheet(np.zeros((3, 2, 2, 3), dtype=np.uint8)).shape == (4, 8, 3)
-
-
-def test_colours_outside_the_range_are_clipped():
-    image = torch.tensor([-1.0, 0.5, 2.0]).reshape(1, 3, 1, 1)
-    assert to_uint8(image).ravel().tolist() == [0, 128, 255]
+        evenly_chosen(frames[:0])

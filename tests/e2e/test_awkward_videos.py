@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -48,5 +49,5 @@ def test_frames_without_the_person_are_left_out_and_named(
     assert result.exit_code == 0, result.output
     used = load_npz(next((out / "store").rglob("body.npz")), ["used"])["used"]
     assert used.tolist() == [False] * 3 + [True] * 3
-    notes = next((out / "store").rglob("fit.json")).read_text()
-    assert '"frames_without_person": "0-2"' in notes
+    notes = json.loads(next((out / "store").rglob("fit.json")).read_text())
+    assert notes["frames_without_person"] == [[0, 2]]

@@ -25,7 +25,8 @@ def stack(n: int, opacity: float, spread: float, scale: float = 0.4) -> Scene:
 @pytest.mark.parametrize("rasterize_mode", ["classic", "antialiased"])
 def test_opacity_at_its_ends_matches_the_oracle(opacity: float, rasterize_mode: str) -> None:
     def edit(scene: Scene) -> Scene:
-        return with_rows(scene, [0, 5, 9, 20], opacities=opacity)
+        # Wide enough that pixels lie where alpha exceeds the clamp.
+        return with_rows(scene, [0, 5, 9, 20], opacities=opacity, scales=[0.7, 0.6, 0.5])
 
     assert_matches_oracle(rasterization, calm_scene(1, n=30, rasterize_mode=rasterize_mode, edit=edit))
 
@@ -66,8 +67,8 @@ def test_a_thousand_faint_layers_match_the_oracle() -> None:
 @pytest.mark.parametrize("opacity", [0.01, 0.5, 1.0])
 def test_five_thousand_identical_gaussians_match_the_oracle(opacity: float) -> None:
     scene = stack(5000, opacity, 0.0, scale=30.0)
-    # The Gaussian that meets the transmittance stop may be the next one: it carries 1e-4 of the pixel at most.
-    assert_matches_oracle(rasterization, scene, image_atol=1e-5 if opacity < 1 else 1e-3, grad_rtol=1e-3)
+    # At opacity 1 the pixel keeps 1 - 0.999, of which float32 knows four digits less than of 1.
+    assert_matches_oracle(rasterization, scene, grad_rtol=1e-4 if opacity < 1 else 2e-4)
 
 
 def test_transmittance_stop_leaves_out_what_crosses_it_and_all_behind() -> None:
