@@ -65,7 +65,7 @@ def _draw_precision(axis: Axes, rows: list[dict]) -> None:
         times = [row["cpu_s"]["median"] * 1e3 for row in mine]
         errors = [row["errors"]["image_rms"] for row in mine]
         axis.loglog(times, errors, "o-", markersize=4, linewidth=0.8, label=knob.removeprefix("raster."))
-    axis.set_xlabel("forward + backward, CPU ms (1k Gaussians, 64 x 64)")
+    axis.set_xlabel("forward + backward, CPU ms (2k Gaussians, 128 x 128)")
     axis.set_ylabel("image error, rms, against the float64 oracle")
     axis.set_title("what accuracy costs")
     axis.legend(fontsize=8)

@@ -84,7 +84,7 @@ def test_gradient_of_projected_means_is_retained(backend: str) -> None:
     weights = torch.rand(colors.shape, generator=torch.Generator().manual_seed(0))
     (colors * weights.to(colors)).sum().backward()
     half = oracle.quat_to_matrix(scene["quats"].double()) * scene["scales"].double()[:, None]
-    camera = scene["viewmats"][0].double(), scene["Ks"][0].double(), 40, 33, 0.01, 1e10, 0.3, "pinhole", True
+    camera: Any = scene["viewmats"][0].double(), scene["Ks"][0].double(), 40, 33, 0.01, 1e10, 0.3, "pinhole", True
     splats = oracle.project(scene["means"].detach().double(), half @ half.transpose(1, 2), *camera)
     means2d = splats.means2d.clone().requires_grad_()
     image = oracle.camera_image(

@@ -47,7 +47,7 @@ def test_flip_margin_sees_an_alpha_at_the_cutoff() -> None:
     scene["opacities"] = scene["opacities"].double()
     assert scenes.flip_margin(scene) > scenes.FLIP_MARGIN
     covars = scenes.oracle.quat_to_matrix(scene["quats"].double()) * scene["scales"].double()[:, None]
-    camera = scene["viewmats"][0].double(), scene["Ks"][0].double(), 40, 33, 0.01, 1e10, 0.3, "pinhole", True
+    camera: Any = scene["viewmats"][0].double(), scene["Ks"][0].double(), 40, 33, 0.01, 1e10, 0.3, "pinhole", True
     splats = scenes.oracle.project(scene["means"].double(), covars @ covars.transpose(1, 2), *camera)
     pixel = splats.means2d[:1].floor() + 0.5
     share = scenes.oracle.pixel_alphas(splats, torch.ones(len(splats.ids)).double(), pixel)[0, 0]

@@ -29,7 +29,7 @@ def check(scene: dict[str, Any], names: list[str]) -> None:
 @pytest.mark.parametrize("camera_model", ["pinhole", "ortho"])
 @pytest.mark.parametrize("rasterize_mode", ["classic", "antialiased"])
 def test_projection(camera_model: str, rasterize_mode: str) -> None:
-    options = {"camera_model": camera_model, "rasterize_mode": rasterize_mode}
+    options: Any = {"camera_model": camera_model, "rasterize_mode": rasterize_mode}
     check(calm_scene(1, n=4, width=9, height=8, dtype=torch.float64, **options), PROJECTION)
 
 
