@@ -14,7 +14,7 @@ from ahoy_core.splat import oracle, rasterization
 from benchmarks.scenes import Scene, SceneSpec, make_scene
 
 SPEC = SceneSpec("2k@128", 2_000, 128, 6.0)  # small enough for the dense oracle, as crowded per pixel as the large ones
-ALPHA_MAX = 0.999  # gsplat's clamp is part of the definition, not a shortcut: the reference has it too
+ALPHA_MAX = 0.999  # gsplat's clamps are part of the model, not shortcuts: the reference has them too
 NO_THRESHOLDS = {"alpha_cutoff": 1e-7, "transmittance_stop": 1e-12}  # so that rounding alone is left
 
 
@@ -36,7 +36,7 @@ SWEEPS = (
 
 
 def accuracy_rows(knob: Sweep) -> list[dict[str, Any]]:
-    """Measure one knob; the reference has no cutoff, no stop and no radius rule, but gsplat's clamp."""
+    """Measure one knob; the reference has no cutoff, no stop and no radius rule, but gsplat's clamps."""
     scene = make_scene(SPEC)
     reference = _reference(scene)
 
@@ -67,7 +67,13 @@ def _leaves(scene: Scene, dtype: torch.dtype) -> list[Tensor]:
 def _reference(scene: Scene) -> tuple[Tensor, list[Tensor]]:
     inputs = _leaves(scene, torch.float64)
     image, _ = oracle.render(
-        *inputs, scene.Ks.double(), SPEC.size, SPEC.size, backgrounds=scene.backgrounds.double(), alpha_max=ALPHA_MAX
+        *inputs,
+        scene.Ks.double(),
+        SPEC.size,
+        SPEC.size,
+        backgrounds=scene.backgrounds.double(),
+        alpha_max=ALPHA_MAX,
+        frustum_clamp=True,
     )
     image.backward(scene.v_render.double())
     return image.detach(), [value.grad for value in inputs if value.grad is not None]

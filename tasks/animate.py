@@ -69,4 +69,4 @@ def _roles(config: AnimateConfig) -> Mapping[str, Role]:
     return {"body": packaged_body(), "rasterizer": ours("ahoy_core.splat on the CPU")}
 
 
-ANIMATE = Stage("animate", 1, AnimateConfig, ("coarse",), run_animate, _roles)
+ANIMATE = Stage("animate", 2, AnimateConfig, ("coarse",), run_animate, _roles)

@@ -130,4 +130,4 @@ def _roles(config: CoarseConfig) -> Mapping[str, Role]:
     return {"body": packaged_body(), "rasterizer": ours("ahoy_core.splat on the CPU")}
 
 
-COARSE = Stage("coarse", 1, CoarseConfig, ("ingest", "perceive", "texture"), run_coarse, _roles)
+COARSE = Stage("coarse", 2, CoarseConfig, ("ingest", "perceive", "texture"), run_coarse, _roles)

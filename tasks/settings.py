@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import json
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, ValidationError
@@ -30,19 +31,23 @@ class Settings(BaseModel):
     report: ReportConfig = ReportConfig()
 
     def with_overrides(self, overrides: Iterable[str]) -> Settings:
-        """Return a copy with `stage.knob=value` applied, validated as if written in a file.
+        """Return a copy with `stage.knob=value` (or `stage.group.knob=value`) applied, validated like any settings.
 
         Raises:
             ValueError: an override is not of that form, or names no knob, or its value does not fit.
         """
         values: dict[str, Any] = self.model_dump(mode="json")
+        known = dict(_leaves(values))
         for text in overrides:
             name, equals, value = text.partition("=")
-            stage, dot, knob = name.strip().partition(".")
-            if not (equals and dot) or stage not in values or knob not in values[stage]:
-                known = ", ".join(f"{s}.{k}" for s, knobs in values.items() for k in knobs)
-                raise ValueError(f"expected STAGE.KNOB=VALUE, got {text!r}; the knobs are: {known}")
-            values[stage][knob] = _literal(value)
+            path = tuple(name.strip().split("."))
+            if not equals or path not in known:
+                names = ", ".join(".".join(knob) for knob in known)
+                raise ValueError(f"expected STAGE.KNOB=VALUE, got {text!r}; the knobs are: {names}")
+            group = values
+            for part in path[:-1]:
+                group = group[part]
+            group[path[-1]] = _literal(value)
         try:
             return Settings.model_validate(values)
         except ValidationError as error:
@@ -50,10 +55,17 @@ class Settings(BaseModel):
             raise ValueError(f"the settings do not fit: {lines}; `ahoy run --help` lists the knobs") from None
 
 
+def _leaves(values: Mapping[str, Any], path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Every knob with the names that lead to it."""
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            yield from _leaves(value, (*path, name))
+        else:
+            yield (*path, name), value
+
+
 def _literal(text: str) -> Any:
     """Read `3`, `0.5`, `true`, `null` as JSON does, anything else as text."""
-    import json
-
     try:
         return json.loads(text)
     except json.JSONDecodeError:

@@ -124,7 +124,7 @@ class _Run:
         n_joints: int,
     ) -> None:
         self.template, self.frames, self.held_out = template, frames, held_out
-        self.views = _weigh_head(views, template, config.weights.head)
+        self.views = weigh_head(views, template, config.weights.head)
         self.config, self.n_joints = config, n_joints
         self.generator = torch.Generator().manual_seed(config.seed)
         sizes = network_config(template, config.width, offset_channels(template))
@@ -224,7 +224,7 @@ class _Run:
 
 
 @torch.no_grad()
-def _weigh_head(views: CanonicalViews, template: Template, factor: float) -> CanonicalViews:
+def weigh_head(views: CanonicalViews, template: Template, factor: float) -> CanonicalViews:
     """The canonical views with the weight of the head's pixels times `factor`."""
     half = template.rotations * template.scales[:, None, :]
     head = template.head[:, None].to(template.means).repeat(1, 3)

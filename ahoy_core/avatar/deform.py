@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import cast
 
 import torch
 from pydantic import BaseModel, ConfigDict, Field
@@ -33,9 +35,9 @@ class OffsetBounds(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    position: float = Field(default=0.05, gt=0, description="metres, per axis")
-    rotation: float = Field(default=0.8, gt=0, description="radians, per axis")
-    log_scale: float = Field(default=1.0, gt=0, description="natural logarithm of the factor")
+    position: float = Field(default=0.08, gt=0, description="metres, per axis")
+    rotation: float = Field(default=0.2, gt=0, description="radians, per axis")
+    log_scale: float = Field(default=0.4, gt=0, description="natural logarithm of the factor")
     opacity: float = Field(default=6.0, gt=0, description="logit")
     color: float = Field(default=1.0, gt=0, description="sRGB")
     skin: float = Field(default=3.0, gt=0, description="logit of a skinning weight")
@@ -109,9 +111,9 @@ def dense_weights(indices: Tensor, weights: Tensor, n_joints: int) -> Tensor:
 
 
 @lru_cache(maxsize=2)
-def _canonical_pose(body: BodyModel) -> Tensor:
+def _canonical_pose(body: Hashable) -> Tensor:
     """The canonical pose of a body, which costs more to find than a frame's other transforms together."""
-    return canonical_pose(body)
+    return canonical_pose(cast(BodyModel, body))
 
 
 def relative_transforms(body: BodyModel, pose: Tensor, betas: Tensor, transl: Tensor) -> Tensor:
@@ -127,7 +129,7 @@ def relative_transforms(body: BodyModel, pose: Tensor, betas: Tensor, transl: Te
         [B,J,4,4]; the identity where pose is the canonical pose and transl is 0.
     """
     shapes = betas.to(pose)[None]
-    start = body(_canonical_pose(body).to(pose)[None], shapes, torch.zeros_like(transl[:1])).transforms
+    start = body(_canonical_pose(cast(Hashable, body)).to(pose)[None], shapes, torch.zeros_like(transl[:1])).transforms
     posed = body(pose, shapes.expand(len(pose), -1), transl).transforms
     rotation = start[:, :, :3, :3].transpose(-1, -2)
     shift = -(rotation @ start[:, :, :3, 3:])

@@ -23,16 +23,19 @@ class LossWeights(BaseModel):
     filled: float = Field(default=0.3, ge=0, le=1, description="a canonical pixel that was filled, not seen; seen: 1")
     outside: float = Field(default=0.05, ge=0, le=1, description="a canonical pixel beside the bare body")
     gradient: float = Field(default=0.5, ge=0, description="L1 of image differences beside every L1 of colours")
-    head: float = Field(default=1.0, ge=0, description="factor on the canonical views' head, where errors are seen first")
+    head: float = Field(
+        default=4.0, ge=0, description="factor on the canonical views' head, where errors are seen first"
+    )
     alpha: float = Field(default=0.2, ge=0, description="L1 of the canonical views' alpha")
-    empty: float = Field(default=0.0, ge=0, description="alpha of observed pixels that are surely background")
-    solid: float = Field(default=0.0, ge=0, description="missing alpha where the person is seen")
+    empty: float = Field(default=0.3, ge=0, description="alpha of observed pixels that are surely background")
+    solid: float = Field(default=0.2, ge=0, description="missing alpha where the person is seen")
     offset: float = Field(default=0.02, ge=0, description="squared offsets over 1 cm")
-    strain: float = Field(default=0.0, ge=0, description="squared change of the offset over the way to a neighbour")
+    strain: float = Field(default=0.1, ge=0, description="squared change of the offset over the way to a neighbour")
     scale: float = Field(default=0.01, ge=0, description="squared log scale factors")
-    growth: float = Field(default=0.0, ge=0, description="squared log scale factors of axes that grew, on top of `scale`")
-    scale_change: float = Field(default=0.0, ge=0, description="squared difference of log scale factors of neighbours")
-    color_change: float = Field(default=0.0, ge=0, description="squared difference of colour offsets of neighbours")
+    growth: float = Field(
+        default=0.2, ge=0, description="squared log scale factors of axes that grew, on top of `scale`"
+    )
+    scale_change: float = Field(default=0.05, ge=0, description="squared difference of log scale factors of neighbours")
     lbs: float = Field(default=1.0, ge=0, description="squared distance to the body's skinning weights (section 3.3)")
 
 
@@ -113,24 +116,20 @@ class Neighbourhood:
         return (values.index_select(0, self.first) - values.index_select(0, self.second)).square().sum(1)
 
 
-def regularisers(
-    canonical: Canonical, template: Template, around: Neighbourhood, weights: LossWeights
-) -> Tensor:
+def regularisers(canonical: Canonical, template: Template, around: Neighbourhood, weights: LossWeights) -> Tensor:
     """Distance from the template, and unlike offsets of neighbours; each term a mean over Gaussians or pairs.
 
-    Without the second kind, a Gaussian beside the outline of a person who is wider than the fitted body is drawn out to it
-    on its own, or stretched: spikes, which no other view and no other pose forgives.
+    Without the second kind, a Gaussian near the outline of a person who is wider than the fitted body is drawn or
+    stretched out to it on its own: spikes, which no other view and no other pose forgives.
     """
     offset = canonical.means - template.means
     growth = torch.log(canonical.scales / template.scales)
     skin = (canonical.skin_weights - template.skin_weights).square().sum(1).mean()
-    terms = (
-        (weights.offset, lambda: (offset / 0.01).square().mean()),
-        (weights.strain, lambda: around.strain(offset)),
-        (weights.scale, lambda: growth.square().mean()),
-        (weights.growth, lambda: growth.clamp(min=0).square().mean()),
-        (weights.scale_change, lambda: around.change(growth)),
-        (weights.color_change, lambda: around.change(canonical.colors - template.colors)),
-        (weights.lbs, lambda: skin),
+    return (
+        weights.offset * (offset / 0.01).square().mean()
+        + weights.strain * around.strain(offset)
+        + weights.scale * growth.square().mean()
+        + weights.growth * growth.clamp(min=0).square().mean()
+        + weights.scale_change * around.change(growth)
+        + weights.lbs * skin
     )
-    return torch.stack([weight * term() for weight, term in terms if weight > 0] or [skin.new_zeros(())]).sum()

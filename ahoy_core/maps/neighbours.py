@@ -11,9 +11,9 @@ from ahoy_core.maps.template import Template
 
 NEAREST = 6
 """Neighbours looked for: on a grid the four beside and two of the diagonal ones."""
-# Further than this many pitches apart, two Gaussians are not side by side (the diagonal of a stretched pixel is 2.7).
+# Further than this many pitches apart, two Gaussians are not side by side: on a slope the grid leaves up to two.
 _REACH = 3.0
-# Cosine between the normals of neighbours, at least: the two sides of a finger or a fold are near and yet no neighbours.
+# Least cosine between the normals of neighbours: the two sides of a finger are near each other, and no neighbours.
 _SAME_SIDE = 0.3
 
 

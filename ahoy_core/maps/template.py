@@ -27,8 +27,8 @@ IN_CHANNELS_PER_SIDE = 7
 # Standard deviation of a disk over the distance to its neighbours: 0.7 leaves under 3% light through a grid of opaque
 # disks and still keeps two neighbours apart; less shows holes, more blurs.
 _SPREAD = 0.7
-# Disks on a surface seen at a glancing angle are stretched by 1/cos, at most this much: beyond it another view has
-# samples.
+# Disks on a surface seen at a glancing angle are stretched by 1/cos, at most this much: beyond it another view fills
+# the gaps, and a longer disk would stand out from a thin limb, seen from aside, as a bristle.
 _MAX_STRETCH = 1.5
 _THICKNESS = 0.15
 _OPACITY = 0.98
@@ -106,8 +106,8 @@ class Template:
 
     @property
     def observed_share(self) -> float:
-        """Share of the surface's area that the video showed, in [0,1]."""
-        return float((self.areas * self.observed).sum() / self.areas.sum().clamp(min=1e-12))
+        """Share of the surface's area that the video showed at all, however grazing, in [0,1]."""
+        return float((self.areas * (self.observed > 0)).sum() / self.areas.sum().clamp(min=1e-12))
 
 
 def textured_faces(body: BodyModel) -> Tensor:

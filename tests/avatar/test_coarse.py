@@ -8,10 +8,11 @@ import pytest
 import torch
 
 from ahoy_core.avatar import AvatarInfo, CoarseConfig, CoarseResult, train_coarse
-from ahoy_core.avatar.coarse import textured_template
+from ahoy_core.avatar.coarse import textured_template, weigh_head
 from ahoy_core.avatar.losses import LossWeights, canonical_weight
+from ahoy_core.avatar.render import render
 from ahoy_core.avatar.supervision import canonical_views, observed_frames
-from tests.avatar.scenes import TINY, body, coarse_inputs, with_frames
+from tests.avatar.scenes import TINY, body, coarse_inputs, dressed, with_frames
 
 INFO = AvatarInfo(body=body().name)
 
@@ -104,6 +105,39 @@ def test_black_frames_give_a_finite_avatar():
         assert torch.isfinite(getattr(result.avatar, name)).all(), name
 
 
+def test_empty_pixels_are_away_from_the_visible_person_and_from_the_fitted_body():
+    inputs = coarse_inputs(count=2)
+    body_only = torch.zeros_like(inputs.masks)
+    body_only[0, 8:20, 30:36] = 1.0  # a part of the body behind something, beside what is seen
+    confidence = torch.tensor([0.5, 1.0])
+    (first, second), _ = observed_frames(with_frames(inputs, silhouettes=body_only, confidence=confidence), limit=9)
+    seen = first.weight[0] > 0.05
+    assert float(first.empty[0][seen].max()) == 0
+    assert set(first.empty.unique().tolist()) == {0.0, 0.5}
+    assert set(second.empty.unique().tolist()) == {0.0, 1.0}
+    # Cut to the same box, the hidden part is where the two differ in more than the person's own turn.
+    alone = observed_frames(with_frames(inputs, silhouettes=body_only * 0, confidence=confidence), limit=9)[0][0]
+    assert int((alone.empty > first.empty).sum()) > 0 and not bool((alone.empty < first.empty).any())
+
+
+def test_training_clears_what_lies_beside_the_person():
+    """Frames of a slimmer person: alpha beside it goes down, and further with the term for empty pixels."""
+    inputs = coarse_inputs()
+    slim = with_frames(inputs, masks=inputs.masks * 0, silhouettes=inputs.masks * 0)
+    middle = inputs.masks.shape[2] // 2
+    slim.masks[:, :, middle - 4 : middle + 4] = inputs.masks[:, :, middle - 4 : middle + 4]
+    weights = LossWeights(canonical=0.0)
+    spilled = []
+    for empty in (0.0, 1.0):
+        config = _short(steps=12, weights=weights.model_copy(update={"empty": empty}))
+        avatar = train_coarse(slim, config, INFO).avatar
+        frame = observed_frames(slim, 1)[0][0]
+        posed = avatar.pose(inputs.body, slim.pose[frame.number], slim.transl[frame.number])
+        shown = render(posed.means, posed.covars, posed.opacities, posed.colors, frame.camera).alphas[0]
+        spilled.append(float((shown * frame.empty).sum()))
+    assert spilled[1] < 0.9 * spilled[0]
+
+
 def test_a_canonical_view_with_nan_is_left_out_and_reported():
     inputs = coarse_inputs(count=1)
     views = inputs.views.clone()
@@ -120,6 +154,17 @@ def test_seen_canonical_pixels_outweigh_filled_ones_and_those_beside_the_body_co
     coverage[0] = 1.0
     weight = canonical_weight(coverage, alpha, LossWeights(filled=0.25, outside=0.125))
     assert weight.tolist() == [[1.0], [0.25], [0.125]]
+
+
+def test_the_head_weighs_more_in_the_canonical_views_and_the_rest_as_before():
+    inputs = coarse_inputs(count=1)
+    views, _ = canonical_views(inputs, LossWeights())
+    ratio = weigh_head(views, dressed(), 4.0).weight[:, 0] / views.weight[:, 0]
+    rows = torch.nonzero(views.alpha[0, 0].amax(1) > 0.5)[:, 0]
+    top, height = int(rows[0]), int(rows[-1] - rows[0])
+    middle = views.alpha.shape[3] // 2
+    assert float(ratio[0, top + height // 16, middle]) > 3.5
+    assert torch.allclose(ratio[:, top + height // 4 :], torch.ones(1), atol=1e-3)
 
 
 def test_a_hopeless_held_out_frame_stops_training_and_keeps_the_best_network():
@@ -146,6 +191,8 @@ def test_inputs_that_do_not_fit_together_are_refused():
     inputs = coarse_inputs(count=2)
     with pytest.raises(ValueError, match="expected 2 rows of masks"):
         with_frames(inputs, masks=inputs.masks[:1])
+    with pytest.raises(ValueError, match="silhouettes as the masks"):
+        with_frames(inputs, silhouettes=inputs.masks[:, :-1])
     with pytest.raises(ValueError, match="channel-first"):
         with_frames(inputs, frames=inputs.frames.permute(0, 2, 3, 1))
     with pytest.raises(ValueError, match="canonical views"):

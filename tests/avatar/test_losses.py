@@ -10,7 +10,7 @@ from ahoy_core.avatar.losses import LossWeights, Neighbourhood, regularisers
 from ahoy_core.maps.template import Template
 from tests.avatar.scenes import template
 
-NOTHING = LossWeights(offset=0, strain=0, scale=0, growth=0, scale_change=0, color_change=0, lbs=0)
+NOTHING = LossWeights(offset=0, strain=0, scale=0, growth=0, scale_change=0, lbs=0)
 
 
 def _still() -> tuple[Template, Canonical]:
@@ -24,13 +24,13 @@ def _value(canonical: Canonical, name: str) -> float:
     return float(regularisers(canonical, start, Neighbourhood.of(start), weights))
 
 
-@pytest.mark.parametrize("name", ["offset", "strain", "scale", "growth", "scale_change", "color_change", "lbs"])
+@pytest.mark.parametrize("name", ["offset", "strain", "scale", "growth", "scale_change", "lbs"])
 def test_the_template_itself_costs_nothing(name: str):
     assert _value(_still()[1], name) == pytest.approx(0, abs=1e-9)
 
 
 def test_a_shift_of_everything_is_no_strain_and_a_lone_spike_is():
-    start, still = _still()
+    _, still = _still()
     shifted = replace(still, means=still.means + torch.tensor([0.0, 0.03, 0.0]))
     spike = replace(still, means=still.means.index_add(0, torch.tensor([7]), torch.tensor([[0.0, 0.03, 0.0]])))
     assert _value(shifted, "strain") == pytest.approx(0, abs=1e-6)
@@ -53,10 +53,3 @@ def test_growing_costs_and_shrinking_does_not():
     assert _value(replace(still, scales=still.scales * 2), "growth") == pytest.approx(0.4805, abs=1e-3)
     assert _value(replace(still, scales=still.scales / 2), "growth") == 0
     assert _value(replace(still, scales=still.scales * 2), "scale_change") == pytest.approx(0, abs=1e-6)
-
-
-def test_a_tint_of_everything_changes_no_neighbours_and_a_speck_does():
-    _, still = _still()
-    assert _value(replace(still, colors=still.colors + 0.2), "color_change") == pytest.approx(0, abs=1e-6)
-    speck = replace(still, colors=still.colors.index_add(0, torch.tensor([7]), torch.full((1, 3), 0.2)))
-    assert _value(speck, "color_change") > 1e-6
