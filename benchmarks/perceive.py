@@ -1,8 +1,8 @@
 """What perception finds on captures whose truth is known: `python -m benchmarks.perceive CAPTURES_DIR --json OUT`.
 
-One JSON line per capture. Joints are the captures' 24, found on our body by the bone that each one is; errors are in the
-camera's axes. Hidden joints are those whose place is not on the visible part of the person (`vis/`), with two pixels of
-slack. The capture's own camera is given to the method.
+One JSON line per capture. Joints are the captures' 24, found on our body by the bone that each one is; errors are in
+the camera's axes. Hidden joints are those whose place is not on the visible part of the person (`vis/`), with two
+pixels of slack. The capture's own camera is given to the method.
 """
 
 from __future__ import annotations
@@ -67,7 +67,9 @@ def our_joints(body: PackagedBody, found: Perception, motion: Any) -> NDArray[np
 
 def measure(capture: Path, body: PackagedBody, networks: Networks, config: PerceiveConfig) -> dict[str, Any]:
     with av.open(str(capture / "front.mp4")) as container:
-        frames = np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)])
+        frames: NDArray[np.uint8] = np.stack(
+            [frame.to_ndarray(format="rgb24").astype(np.uint8) for frame in container.decode(video=0)]
+        )
     n = len(frames)
     camera = json.loads((capture / "cameras.json").read_text(encoding="utf-8"))["cameras"]["front"]
     K = np.array(camera["K"])

@@ -73,4 +73,4 @@ def _roles(config: PerceiveConfig) -> Mapping[str, Role]:
     return {"body": packaged_body(), "pose": seen_by, "mask": seen_by}
 
 
-PERCEIVE = Stage("perceive", 1, PerceiveConfig, ("ingest",), run_perceive, _roles)
+PERCEIVE = Stage("perceive", 2, PerceiveConfig, ("ingest",), run_perceive, _roles)

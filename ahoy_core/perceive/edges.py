@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -22,7 +23,7 @@ PLACES = 64  # most places a frame
 SPACING = 0.03  # metres between places, at the person's depth
 OUT, IN = 0.08, 0.04  # metres searched outside and inside: an edge far inside is mostly an occluder's
 CLEAR = 0.02  # metres beyond an edge over which the mask must not come back
-INWARD = 0.5  # weight of edges inside the body: clothes never make a person thinner, things in front do
+NEIGHBOURHOOD = 0.15  # metres: an edge inside the body counts by the share of places this near that have an edge
 STEPS = 24  # samples along a normal
 PARALLEL = 0.8  # cosine between the edge's normal and the outline's
 SOFTEN = 0.012  # metres of blur under which the outline's normals are taken
@@ -150,8 +151,14 @@ def _across(
     place = away[best] + share * (away[1] - away[0])
     edges = points + place[:, None] * out
     certain = found & _stays(person, best, clear) & _parallel(mask, edges, out, scale) & _alone(canvas, line, best)
-    inside = ((edges > 1.0) & (edges < np.array(mask.shape[::-1]) - 1.0)).all(1)
-    return edges, (certain & inside) * np.where(place < 0, INWARD, 1.0)
+    certain &= ((edges > 1.0) & (edges < np.array(mask.shape[::-1]) - 1.0)).all(1)
+    return edges, certain * np.where(place < 0, _undisturbed(points, certain, scale), 1.0)
+
+
+def _undisturbed(points: NDArray[np.float64], certain: NDArray[np.bool_], scale: float) -> NDArray[np.float64]:
+    """Squared share [k] of near places that have a certain edge: beside a thing in front many have none."""
+    near = np.linalg.norm(points[:, None] - points[None], axis=-1) < NEIGHBOURHOOD * scale
+    return np.asarray(((near & certain).sum(1) / near.sum(1)) ** 2)
 
 
 def _stays(person: NDArray[np.bool_], best: NDArray[np.int64], clear: int) -> NDArray[np.bool_]:
@@ -184,7 +191,7 @@ def _alone(canvas: NDArray[np.uint8], line: NDArray[np.float64], best: NDArray[n
     return np.asarray(~(body & beyond).any(1))
 
 
-def _sample(image: NDArray[np.float32], points: NDArray[np.floating]) -> NDArray[np.float32]:
+def _sample(image: NDArray[Any], points: NDArray[np.floating]) -> NDArray[np.float32]:
     """Bilinear values at pixels [...,2], centres at +0.5; beyond the border its nearest value."""
     where = (points - 0.5).astype(np.float32).reshape(1, -1, 2)
     values = cv2.remap(image, where[..., 0], where[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)

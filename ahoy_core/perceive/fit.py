@@ -23,6 +23,7 @@ from ahoy_core.perceive.state import State, linearise
 
 SCALES = (0.5, 0.25, 0.1)  # metres: widths of Geman-McClure on the image, one after the other
 OUTLINE_ROUNDS = 2  # edges are looked for anew in each
+OUTLINE_STEPS = 6  # most in each: the start is close, and the edges move on anyway
 FIRST_DAMPING = 1e-2
 MAX_DAMPING = 1e6  # a step this damped does not move: the cost is as low as it gets
 ENOUGH = 1e-4  # share of the cost below which a step's gain ends a stage
@@ -88,9 +89,11 @@ def fit_body(
     total = config.iterations * (1 + len(SCALES) + rounds)
 
     def stage(state: State, number: int, scale: float | None, goal: Objective = objective) -> State:
-        start = config.iterations * number
+        start, most = config.iterations * number, config.iterations
+        if goal.outline is not None:
+            most = min(most, OUTLINE_STEPS)
         report = progress or (lambda done, total, note: None)
-        return _descend(goal, reduced, state, scale, lambda i: report(start + i, total, "fitting the body"))
+        return _descend(goal, reduced, state, scale, most, lambda i: report(start + i, total, "fitting the body"))
 
     state = stage(_start(objective, reduced), 0, None)
     state = replace(state, place=_place(reduced, state, seen))
@@ -127,11 +130,19 @@ def _place(reduced: ReducedBody, state: State, seen: Observations) -> Tensor:
 
 
 def _descend(
-    objective: Objective, reduced: ReducedBody, state: State, scale: float | None, report: Callable[[int], None]
+    objective: Objective,
+    reduced: ReducedBody,
+    state: State,
+    scale: float | None,
+    most: int,
+    report: Callable[[int], None],
 ) -> State:
-    """Levenberg-Marquardt with reweighting; without `scale` the image is left out and bodies stay in place."""
+    """Take at most `most` steps of Levenberg-Marquardt with reweighting.
+
+    Without `scale` the image is left out and bodies stay in place.
+    """
     damping = FIRST_DAMPING
-    for i in range(objective.config.iterations):
+    for i in range(most):
         report(i + 1)
         linear = linearise(reduced, state)
         person = person_depth(linear.landmarks)

@@ -6,8 +6,12 @@ al. (2022).
 
 from __future__ import annotations
 
+import contextlib
+import os
+import sys
+import tempfile
 import threading
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +23,9 @@ DETECTOR_SIZE = 224
 LANDMARKER_SIZE = 256
 N_LANDMARKS = 33
 N_RAW = 39  # 33 landmarks of the body and six that only steer the crop of the next frame
+STDERR = 2  # the descriptor
+_STDERR = threading.Lock()
+BANNER = b"INFO: Created TensorFlow Lite XNNPACK delegate for CPU."
 REQUIRED = ("pose_detection", "pose_landmark_full")
 
 
@@ -45,14 +52,41 @@ class RawLandmarks:
     heatmap: NDArray[np.float32]
 
 
+@contextlib.contextmanager
+def _without_banner() -> Iterator[None]:
+    """Hold back what is written to the process's stderr, and pass on all of it but the library's `BANNER`.
+
+    The native library writes to the descriptor itself and offers no switch, in its environment or its interface.
+    """
+    sys.stderr.flush()
+    with _STDERR, tempfile.TemporaryFile() as held:
+        try:
+            kept = os.dup(STDERR)
+        except OSError:  # stderr is closed: there is nothing to hold back
+            yield
+            return
+        os.dup2(held.fileno(), STDERR)
+        try:
+            yield
+        finally:
+            sys.stderr.flush()
+            os.dup2(kept, STDERR)
+            os.close(kept)
+            held.seek(0)
+            for line in held:
+                if not line.startswith(BANNER):
+                    os.write(STDERR, line)
+
+
 class _Network:
     """One interpreter behind a lock: TFLite's buffers belong to one caller at a time."""
 
     def __init__(self, path: Path, num_threads: int) -> None:
         from ai_edge_litert.interpreter import Interpreter
 
-        self._interpreter = Interpreter(model_path=str(path), num_threads=num_threads)
-        self._interpreter.allocate_tensors()
+        with _without_banner():
+            self._interpreter = Interpreter(model_path=str(path), num_threads=num_threads)
+            self._interpreter.allocate_tensors()
         self._input = self._interpreter.get_input_details()[0]["index"]
         self._outputs = {d["name"]: d["index"] for d in self._interpreter.get_output_details()}
         self._lock = threading.Lock()

@@ -50,7 +50,7 @@ class FitConfig:
     """Knobs of the fit.
 
     Attributes:
-        iterations: most Gauss-Newton steps in each of the four stages.
+        iterations: most Gauss-Newton steps in each stage.
         smoothing: weight of the accelerations. 0 leaves hidden joints to each frame alone; large values make visible
             ones lag.
         pose_prior: weight of the pose prior on joints of which nothing is seen; `SEEN_SHARE` of it on the others.
@@ -134,9 +134,7 @@ def _seen_terms(
     return terms
 
 
-def _outline_terms(
-    objective: Objective, reduced: ReducedBody, state: State, person: Tensor
-) -> dict[str, Tensor]:
+def _outline_terms(objective: Objective, reduced: ReducedBody, state: State, person: Tensor) -> dict[str, Tensor]:
     if objective.outline is None:
         return {}
     offsets = outline_offsets(reduced, state, objective.outline, objective.seen.K, person)
@@ -218,9 +216,7 @@ def _add_seen(
     _add_rows(normal, root * offsets, root[..., None] * rows, per_frame)
 
 
-def _add_outline(
-    normal: Normal, objective: Objective, reduced: ReducedBody, state: State, person: Tensor
-) -> None:
+def _add_outline(normal: Normal, objective: Objective, reduced: ReducedBody, state: State, person: Tensor) -> None:
     outline = objective.outline
     if outline is None:
         return

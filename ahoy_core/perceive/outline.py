@@ -17,8 +17,8 @@ from ahoy_core.perceive.residuals import image_derivatives, safe_depth
 from ahoy_core.perceive.state import State, below, moved_by_shape, right_jacobian
 
 # Metres. Clothes stand off the skin, masks are some pixels wrong, and neighbouring places err together.
-OUTLINE_SPREAD = 0.06
-OUTLINE_SCALE = 0.05  # metres: width of Geman-McClure
+OUTLINE_SPREAD = 0.03
+OUTLINE_SCALE = 0.04  # metres: width of Geman-McClure
 
 
 @dataclass(frozen=True)

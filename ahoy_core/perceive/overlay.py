@@ -10,13 +10,14 @@ import torch
 from numpy.typing import NDArray
 
 from ahoy_core.body.model import BodyModel
-from ahoy_core.perceive.masks import VISIBLE
+from ahoy_core.perceive.masks import VISIBLE, mask_box
 
 if TYPE_CHECKING:
     from ahoy_core.perceive.perceive import Perception
 
-TILE_HEIGHT = 360
-SHEET_WIDTH = 2600  # pixels
+TILE = 480  # pixels, height and width
+SHEET_WIDTH = 2000  # pixels
+MARGIN = 0.15  # of the subject's box, left free on each side of it
 MASK_TINT = (60, 200, 90)
 BONES = (
     (11, 12), (11, 13), (13, 15), (12, 14), (14, 16), (11, 23), (12, 24), (23, 24), (23, 25),
@@ -28,7 +29,9 @@ LEFT, RIGHT, UNSEEN = (255, 170, 40), (60, 170, 255), (150, 150, 150)
 def contact_sheet(
     frames: NDArray[np.uint8], perception: Perception, body: BodyModel, columns: int | None = None, tiles: int = 8
 ) -> NDArray[np.uint8]:
-    """Draw evenly spaced used frames: left half of each tile the mask and landmarks, right half the fitted body.
+    """Draw evenly spaced used frames, cropped to the subject at one scale.
+
+    The left half of each tile shows the mask and the landmarks, the right half the fitted body.
 
     Args:
         frames: [T,H,W,3] sRGB.
@@ -42,23 +45,53 @@ def contact_sheet(
     """
     used = np.flatnonzero(perception.used)
     chosen = used[np.unique(np.linspace(0, len(used) - 1, tiles).round().astype(int))]
-    drawn = [np.concatenate(draw_frame(frames[t], perception, body, int(t)), axis=1) for t in chosen]
+    boxes = subject_boxes(perception, chosen)
+    # One side for all: a tile's size says how large the person is.
+    side = max(1.0, (1 + 2 * MARGIN) * float((boxes[:, 2:] - boxes[:, :2]).max()))
+    centres = 0.5 * (boxes[:, :2] + boxes[:, 2:])
+    drawn = [
+        np.concatenate(draw_frame(frames[t], perception, body, int(t), centre, side), axis=1)
+        for t, centre in zip(chosen, centres, strict=True)
+    ]
     across = min(columns or max(1, SHEET_WIDTH // drawn[0].shape[1]), len(drawn))
     drawn += [np.zeros_like(drawn[0])] * (-len(drawn) % across)
     return np.concatenate([np.concatenate(drawn[i : i + across], axis=1) for i in range(0, len(drawn), across)])
 
 
+def subject_boxes(perception: Perception, chosen: NDArray[np.integer]) -> NDArray[np.float64]:
+    """Boxes [n,4] (x0, y0, x1, y1) round the visible person and the fitted body inside the picture, in n frames."""
+    boxes = []
+    for t in chosen.tolist():
+        shown = mask_box(np.maximum(perception.visible[t], perception.amodal[t]))
+        height, width = perception.visible[t].shape
+        boxes.append(shown if shown.any() else np.array([0, 0, width, height]))
+    return np.asarray(boxes, np.float64)
+
+
 def draw_frame(
-    frame: NDArray[np.uint8], perception: Perception, body: BodyModel, t: int
+    frame: NDArray[np.uint8],
+    perception: Perception,
+    body: BodyModel,
+    t: int,
+    centre: NDArray[np.floating],
+    side: float,
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Return two pictures of one frame, `TILE_HEIGHT` high: mask and landmarks, and the shaded body."""
-    scale = TILE_HEIGHT / frame.shape[0]
-    size = (max(1, round(frame.shape[1] * scale)), TILE_HEIGHT)
-    method = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
-    picture = np.asarray(cv2.resize(frame, size, interpolation=method), dtype=np.uint8)
-    mask = np.asarray(cv2.resize(perception.visible[t], size, interpolation=cv2.INTER_LINEAR), dtype=np.uint8)
+    """Return two pictures [TILE,TILE,3] of a square of one frame: mask and landmarks, and the shaded body.
+
+    Args:
+        frame: [H,W,3] sRGB.
+        perception: what was perceived.
+        body: the body that was fitted.
+        t: number of the frame.
+        centre: [2] of the square, pixels of the frame.
+        side: of the square, pixels; what lies beyond the frame is black.
+    """
+    scale = TILE / side
+    shift = TILE / 2 - scale * np.asarray(centre, np.float64)
+    picture, mask = (_crop(image, scale, shift) for image in (frame, perception.visible[t]))
     seen = draw_mask(picture, mask)
-    draw_landmarks(seen, perception.landmarks[t] * np.array([scale, scale, 1.0]))
+    landmarks = perception.landmarks[t].astype(np.float64)
+    draw_landmarks(seen, np.concatenate([landmarks[:, :2] * scale + shift, landmarks[:, 2:]], axis=1))
     with torch.no_grad():
         posed = body(
             torch.from_numpy(perception.pose[t : t + 1]),
@@ -66,7 +99,17 @@ def draw_frame(
             torch.from_numpy(perception.transl[t : t + 1]),
         )
     K = perception.K.astype(np.float64) * np.array([[scale], [scale], [1.0]])
+    K[:2, 2] += shift
     return seen, draw_body(picture, posed.vertices[0].numpy(), body.faces.numpy(), K)
+
+
+def _crop(image: NDArray[np.uint8], scale: float, shift: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """Scale and shift an image into a tile; pixel centres at +0.5."""
+    # Sampling alone would alias where the tile is smaller than what it shows.
+    smooth = cv2.GaussianBlur(image, (0, 0), 0.5 / scale) if scale < 1 else image
+    offset = shift + 0.5 * scale - 0.5
+    matrix = np.array([[scale, 0.0, offset[0]], [0.0, scale, offset[1]]])
+    return np.asarray(cv2.warpAffine(smooth, matrix, (TILE, TILE), flags=cv2.INTER_LINEAR), dtype=np.uint8)
 
 
 def draw_mask(picture: NDArray[np.uint8], mask: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -41,7 +41,7 @@ class PerceiveConfig(BaseModel):
             too.
         stride: look at every stride-th frame; the others get poses in between and count as unused.
         subject: number of the person, 0 the most prominent; None: the most prominent of each shot.
-        iterations: most steps in each of the fit's four stages; it stops earlier when nothing is gained.
+        iterations: most steps in each of the fit's stages; it stops earlier when nothing is gained.
         smoothing: weight of accelerations in the fit.
         fov_degrees: diagonal field of view assumed where no camera is given.
         outline: weight of the masks' outlines in the fit; 0: landmarks alone.

@@ -44,8 +44,8 @@ class ReducedBody:
         skin: [V,F] skinning weights, those of resting joints folded into the joint that carries them.
         stature: metres from the lowest to the highest point at `base_betas`.
         stature_slopes: [S].
-        reach: [S] metres, root mean square over the surface, per unit of each beta: what it does besides making the
-            whole body larger or smaller.
+        reach: [S] metres, root mean square over the surface, per unit of each beta; of the one that is mostly size,
+            what it does besides making the whole body larger or smaller.
     """
 
     free: tuple[int, ...]
@@ -160,10 +160,15 @@ def reshape(reduced: ReducedBody, body: BodyModel, betas: Tensor) -> ReducedBody
 
 
 def _besides_size(surface: Tensor, slopes: Tensor) -> Tensor:
-    """Root mean square [S] of slopes [S,V,3] after the best shift and uniform growth of the surface [V,3] are off."""
+    """Root mean square [S] of slopes [S,V,3]; uniform growth of the surface [V,3] is taken off the one that is most it.
+
+    Only that one: a parameter like age changes size too, but is not how adults differ in size.
+    """
     centred, moved = surface - surface.mean(0), slopes - slopes.mean(1, keepdim=True)
     growth = (moved * centred).sum((1, 2)) / centred.square().sum()
-    return (moved - growth[:, None, None] * centred).square().sum(-1).mean(-1).sqrt()
+    rest = (moved - growth[:, None, None] * centred).square().sum(-1).mean(-1).sqrt()
+    whole = slopes.square().sum(-1).mean(-1).sqrt()
+    return torch.where(torch.arange(len(slopes)) == (rest / whole.clamp_min(1e-9)).argmin(), rest, whole)
 
 
 def _carriers(parents: Sequence[int], row: dict[int, int]) -> list[int]:

@@ -81,7 +81,7 @@ def test_the_result_is_the_declared_artifact_and_progress_reaches_its_end(
     assert seen[-1][0] == seen[-1][1] and [s[0] for s in seen] == sorted(s[0] for s in seen)
     assert all(np.isfinite(getattr(result, f.name)).all() for f in dataclasses.fields(result) if f.name != "notes")
     sheet = contact_sheet(clip, result, body, columns=2, tiles=3)
-    assert sheet.dtype == np.uint8 and sheet.shape == (720, 1440, 3)
+    assert sheet.dtype == np.uint8 and sheet.shape == (960, 1920, 3)
 
 
 @pytest.mark.shared
