@@ -9,10 +9,10 @@ QUIET_PIP := --disable-pip-version-check --quiet
 .PHONY: demo test lint mutants install models clean
 
 demo: models  ## the main job on the bundled clip; prints where the avatar, the video and the report are
-	$(BIN)/ahoy run ahoy_core/assets/demo.mp4 --out out/demo
+	OMP_WAIT_POLICY=passive $(BIN)/ahoy run ahoy_core/assets/demo.mp4 --out out/demo
 
 test: models lint  ## style, types, layers, then the whole suite
-	$(BIN)/pytest
+	OMP_NUM_THREADS=1 OMP_WAIT_POLICY=passive $(BIN)/pytest --numprocesses auto --dist loadfile
 
 lint: $(INSTALLED)
 	$(BIN)/ruff check .

@@ -46,7 +46,8 @@ def _summary(found: Perception) -> dict[str, Any]:
         "camera": f"{notes['fov_degrees']} degrees diagonal, {notes['fov_from']}",
         "mean confidence": f"{found.frame_confidence[found.used].mean():.2f}",
     }
-    without = [f"no person in frames {notes['frames_without_person']}"] if notes["frames_without_person"] else []
+    gaps = ", ".join(f"{a}-{b}" if b > a else str(a) for a, b in notes["frames_without_person"])
+    without = [f"no person in frames {gaps}; their poses are interpolated and they are not used"] if gaps else []
     return {"facts": facts, "notes": [*without, *(f"{k}: {why}" for k, why in notes["skipped"].items())]}
 
 
