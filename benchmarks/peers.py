@@ -32,10 +32,9 @@ class PeerUnavailableError(RuntimeError):
 
 @dataclass(frozen=True)
 class Peer:
-    """A name, how many counted runs its speed affords, and how to prepare a scene."""
+    """A name, and how to prepare a scene."""
 
     name: str
-    repeats: int
     prepare: Callable[[Scene], Run]
 
 
@@ -225,8 +224,4 @@ def _indices_in_range(
     return torch.from_numpy(gaussians), torch.from_numpy(pixels), torch.zeros(len(pixels), dtype=torch.int64)
 
 
-PEERS = (
-    Peer("ahoy", 15, ours),
-    Peer("C++ AVX2 yardstick", 15, yardstick),
-    Peer("gsplat torch reference", 3, gsplat_torch),
-)
+PEERS = (Peer("ahoy", ours), Peer("C++ AVX2 yardstick", yardstick), Peer("gsplat torch reference", gsplat_torch))
