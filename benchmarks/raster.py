@@ -22,13 +22,13 @@ from typing import Any
 import torch
 
 from ahoy_core.cost import Spread, machine
-from benchmarks.peers import PEERS, Peer, PeerUnavailableError, ours
+from benchmarks.peers import PEERS, Peer, PeerUnavailableError, Run, ours
 from benchmarks.raster_accuracy import SWEEPS, accuracy_rows
 from benchmarks.raster_floor import floor_row
 from benchmarks.scenes import SCENES, SceneSpec, make_scene
 
 Row = dict[str, Any]
-SECONDS_A_PEER, FEWEST_REPEATS, MOST_REPEATS = 10.0, 3, 15  # a slow peer gets fewer turns
+QUICK_S, QUICK_REPEATS, SLOW_REPEATS = 0.3, 15, 3  # a peer whose forward + backward takes longer than this is slow
 OPENSPLAT_RATIO = {
     "10k@256": 11.5,
     "50k@512": 14.6,
@@ -60,41 +60,52 @@ def main() -> None:
 
 
 def peer_rows(spec: SceneSpec, repeats: int | None = None) -> list[Row]:
-    """Measure all peers on a scene, in turns; each forward alone and forward + backward."""
+    """Measure all peers on a scene, forward alone and forward + backward.
+
+    Quick peers take turns with each other, slow ones have their turns afterwards: a peer that sweeps gigabytes through
+    the allocator would otherwise be paid for by whoever comes next.
+    """
     scene = make_scene(spec)
     rows: list[Row] = []
-    ready = []
+    quick: list[tuple[Peer, Run]] = []
+    slow: list[tuple[Peer, Run]] = []
     for peer in PEERS:
         try:
             run = peer.prepare(scene)
             run(True)  # compiles
-            affordable = round(SECONDS_A_PEER / _timed(run, True)[0])
-            ready.append((peer, run, min(repeats or MOST_REPEATS, max(FEWEST_REPEATS, affordable))))
+            (quick if _timed(run, True)[0] < QUICK_S else slow).append((peer, run))
         except PeerUnavailableError as reason:
             rows.append({"kind": "omission", "scene": spec.name, "peer": peer.name, "why": str(reason)})
     for backward in (False, True):
-        times: dict[str, list[tuple[float, float]]] = {peer.name: [] for peer, _, _ in ready}
-        for turn in range(max(count for _, _, count in ready)):
-            for peer, run, count in ready:
-                if turn < count:
-                    if count == MOST_REPEATS:
-                        run(backward)  # a quick peer is measured warm, not right after another has swept the caches
-                    times[peer.name].append(_timed(run, backward))
-        rows += [_peer_row(spec, peer, backward, times) for peer, _, _ in ready]
+        times = _in_turns(quick, repeats or QUICK_REPEATS, backward)
+        for each in slow:
+            times |= _in_turns([each], repeats or SLOW_REPEATS, backward)
+        rows += [_peer_row(spec, peer, backward, times) for peer, _ in quick + slow]
     return rows
 
 
+def _in_turns(peers: list[tuple[Peer, Run]], turns: int, backward: bool) -> dict[str, list[tuple[float, float]]]:
+    times: dict[str, list[tuple[float, float]]] = {peer.name: [] for peer, _ in peers}
+    for _ in range(turns):
+        for peer, run in peers:
+            if len(peers) > 1:
+                run(backward)  # each is measured warm, not right after the other has swept the caches
+            times[peer.name].append(_timed(run, backward))
+    return times
+
+
 def _peer_row(spec: SceneSpec, peer: Peer, backward: bool, times: dict[str, list[tuple[float, float]]]) -> Row:
-    mine, base = times[peer.name], times[PEERS[0].name]
-    pairs = [cpu / reference for (_, cpu), (_, reference) in zip(mine, base, strict=False)]
+    mine, base = ([cpu for _, cpu in times[name]] for name in (peer.name, PEERS[0].name))
+    paired = len(mine) == len(base)
+    ratios = [a / b for a, b in zip(mine, base, strict=True)] if paired else [a / Spread.of(base).median for a in mine]
     return {
         "kind": "speed",
         "scene": spec.name,
         "peer": peer.name,
         "pass": "forward+backward" if backward else "forward",
-        "cpu_ms": asdict(Spread.of([cpu * 1e3 for _, cpu in mine])),
-        "wall_ms": asdict(Spread.of([wall * 1e3 for wall, _ in mine])),
-        "cpu_over_ahoy": asdict(Spread.of(pairs)),
+        "cpu_ms": asdict(Spread.of([cpu * 1e3 for cpu in mine])),
+        "wall_ms": asdict(Spread.of([wall * 1e3 for wall, _ in times[peer.name]])),
+        "cpu_over_ahoy": asdict(Spread.of(ratios)),
     }
 
 

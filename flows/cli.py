@@ -17,7 +17,7 @@ from flows import models_cli
 if TYPE_CHECKING:
     from flows.request import VideoRequest
 
-app = typer.Typer(no_args_is_help=True, add_completion=False, help=__doc__, pretty_exceptions_enable=False)
+app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 app.add_typer(models_cli.app, name="models")
 
 EXIT_BAD_INPUT = 2

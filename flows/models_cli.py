@@ -10,7 +10,7 @@ from rich.table import Table
 
 from tasks import model_files
 
-app = typer.Typer(no_args_is_help=True, help=__doc__)
+app = typer.Typer(no_args_is_help=True, help="The files of the networks that fill roles: list, pull, verify.")
 console = Console()
 
 EXIT_BAD_MODEL = 3
