@@ -2,57 +2,29 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
-import av
 import cv2
 import numpy as np
 import pytest
 import torch
 
-from ahoy_core.body.convert import from_local_ref
 from ahoy_core.body.packaged import PackagedBody, load_packaged_body
 from ahoy_core.texture.inputs import TextureConfig
 from ahoy_core.texture.rays import Caster, hit_map, to_camera
 from ahoy_core.texture.surface import Surface, interpolate_uv
 from ahoy_core.texture.texels import pad_charts, sample_atlas
 from ahoy_core.texture.texture import Texture, build_texture
-
-
-def true_fit(folder: Path, body: PackagedBody) -> dict[str, np.ndarray]:
-    """Perception arrays of a capture's ground truth."""
-    motion = np.load(folder / "motion.npz")
-    phenotype = json.loads(str(motion["phenotype"]))
-    betas = torch.tensor([phenotype[name] for name in body.beta_names])
-    pose, transl = from_local_ref(body, torch.from_numpy(motion["pose_local_ref"]), betas)
-    camera = json.loads((folder / "cameras.json").read_text())["cameras"]["front"]
-    viewmat = np.eye(4, dtype=np.float32)
-    viewmat[:3, :3], viewmat[:3, 3] = camera["R"], camera["t"]
-    count = len(pose)
-    return {
-        "pose": pose.float().numpy(),
-        "transl": transl.float().numpy(),
-        "betas": betas.float().numpy(),
-        "expression": np.zeros((count, body.n_expressions), dtype=np.float32),
-        "joint_confidence": np.ones((count, body.n_joints), dtype=np.float32),
-        "frame_confidence": np.ones(count, dtype=np.float32),
-        "used": np.ones(count, dtype=bool),
-        "viewmat": viewmat,
-        "K": np.array(camera["K"], dtype=np.float32),
-    }
+from benchmarks.captures import read_capture, true_fit
 
 
 @pytest.fixture(scope="module")
 def capture(shared_dir: Path) -> tuple[Path, PackagedBody, dict[str, np.ndarray], Texture]:
-    folder = shared_dir / "captures" / "a"
+    truth = read_capture(shared_dir / "captures" / "a")
     body = load_packaged_body()
-    fit = true_fit(folder, body)
-    with av.open(str(folder / "front.mp4")) as video:
-        frames = np.stack([frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)])
-    masks = np.stack([cv2.imread(str(folder / "vis" / f"{t:03d}.png"), -1) for t in range(len(frames))])
+    fit = true_fit(truth, body)
     config = TextureConfig(atlas_size=256, frame_stride=8, canonical_height=256, canonical_width=192)
-    return folder, body, fit, build_texture(frames, masks, fit, body, config)
+    return truth.folder, body, fit, build_texture(truth.frames, truth.visible, fit, body, config)
 
 
 @pytest.mark.shared
