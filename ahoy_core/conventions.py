@@ -211,10 +211,7 @@ def canonical_cameras(vertices: Tensor, height: int, width: int) -> Cameras:
     azimuths = torch.deg2rad(torch.tensor(CANONICAL_AZIMUTHS, dtype=points.dtype, device=points.device))
     # Any distance gives the same orthographic picture; two diagonals keep all of the body in front of the camera.
     viewmats = look_at(orbit_eyes(center, 2.0 * float(extent.norm()), azimuths), center)
-    K = torch.tensor(
-        [[scale, 0, width / 2], [0, scale, height / 2], [0, 0, 1]], dtype=points.dtype, device=points.device
-    )
-    return Cameras(viewmats, K.expand(4, 3, 3).clone(), width, height, "ortho")
+    return Cameras(viewmats, _centered_Ks(scale, width, height, viewmats), width, height, "ortho")
 
 
 def turntable_cameras(
@@ -238,10 +235,7 @@ def turntable_cameras(
         raise ValueError(f"expected n, radius and focal above 0, got n={n}, radius={radius}, focal={focal}")
     azimuths = torch.arange(n, dtype=center.dtype, device=center.device) * (2 * math.pi / n)
     viewmats = look_at(orbit_eyes(center, radius, azimuths, elevation), center)
-    K = torch.tensor(
-        [[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=center.dtype, device=center.device
-    )
-    return Cameras(viewmats, K.expand(n, 3, 3).clone(), width, height, "pinhole")
+    return Cameras(viewmats, _centered_Ks(focal, width, height, viewmats), width, height, "pinhole")
 
 
 def _centered_Ks(focal: float, width: int, height: int, like: Tensor) -> Tensor:  # noqa: N802
