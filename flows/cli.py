@@ -12,13 +12,15 @@ from pydantic import ValidationError
 from rich.console import Console
 from rich.markup import escape
 
-from flows import models_cli
+from flows import models_cli, server_cli
 
 if TYPE_CHECKING:
     from flows.request import VideoRequest
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 app.add_typer(models_cli.app, name="models")
+for command in (server_cli.server, server_cli.worker, server_cli.install):
+    app.command()(command)
 
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
