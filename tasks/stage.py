@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import traceback
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -95,6 +95,8 @@ class Stage:
         needs: names of the inputs; an upstream stage, or `source` for the video itself.
         run: writes the files that `storage_schema.artifacts.ARTIFACTS[name]` declares into `ctx.out`.
         roles: who fills which role under a configuration.
+        slots: names of scarce resources (`gpu`, `download`) that making it takes one slot each of, under a
+            configuration; a stage that is found in the store takes none.
     """
 
     name: str
@@ -103,6 +105,7 @@ class Stage:
     needs: tuple[str, ...]
     run: Callable[[Any, StageContext], StageOutput]
     roles: Callable[[Any], Mapping[str, Role]] = lambda config: {}
+    slots: Callable[[Any], Sequence[str]] = lambda config: ()
 
 
 @dataclass(frozen=True)
@@ -142,7 +145,11 @@ class Source:
 
 @dataclass(frozen=True)
 class Run:
-    """One attempt at one video: where its artifacts and rows go, and who watches."""
+    """One attempt at one video: where its artifacts and rows go, and who watches.
+
+    Attributes:
+        take_slots: waits for one slot of each named resource and holds them while its block runs.
+    """
 
     store: ArtifactStore
     tables: Tables
@@ -150,6 +157,7 @@ class Run:
     video_id: str
     run_id: str
     observer: Observer
+    take_slots: Callable[[Sequence[str]], AbstractContextManager[Any]] = lambda names: nullcontext()
 
 
 def run_stage(stage: Stage, config: BaseModel, inputs: Mapping[str, StageRef | Source], run: Run) -> StageRef:
@@ -181,7 +189,9 @@ def run_stage(stage: Stage, config: BaseModel, inputs: Mapping[str, StageRef | S
             manifest = run.store.lookup(key, stage=stage.name)  # whoever held the lease may just have made it
             if manifest is None:
                 state = "done"
-                manifest = _make(stage, config, inputs, run, key, hashes, roles, started)
+                # The lease first: whoever holds a slot never waits for a lease, so nobody waits in a circle.
+                with run.take_slots(stage.slots(config)):
+                    manifest = _make(stage, config, inputs, run, key, hashes, roles, started)
     ref = StageRef(stage.name, key, manifest.content_hash, state, Bill(**manifest.summary["bill"]))
     if state == "cached":
         run.tables.append("stages", [_row(run, stage, config, key, "cached", started, Bill())], batch=run.batch)
