@@ -18,7 +18,6 @@ from tasks.settings import Preset, Settings
 from tasks.sources import fetch_source, policy_from_environment
 from tasks.stage import Observer, Run, Source
 
-
 _NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]*$"
 
 
@@ -67,11 +66,15 @@ class VideoRequest(BaseModel):
         """Open the store that the results go to."""
         return ArtifactStore(self.store or Path(self.out or ".") / "store", artifacts=artifacts)
 
-    def run(self, source: Source, observer: Observer) -> Run:
-        """Open the store and name this attempt."""
-        store = self.open_store()
-        video_id = self.video_id or f"{source.name}-{source.content_hash[:8]}"
-        return Run(store, Tables(store), self.batch, video_id, uuid.uuid4().hex[:12], observer)
+    def id_of(self, source: Source) -> str:
+        """Return the video's id: the one asked for, or one made of the file's name and content."""
+        return self.video_id or f"{source.name}-{source.content_hash[:8]}"
+
+    def run(self, video_id: str, observer: Observer, store: ArtifactStore | None = None) -> Run:
+        """Name this attempt; its results go to `store`, opened here unless given."""
+        store = store or self.open_store()
+        run_id = uuid.uuid4().hex[:12]
+        return Run(store, Tables(store), self.batch, video_id, run_id, observer, attempt_number=self.attempt)
 
 
 def source_cache() -> Path:

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from flows.serve.errors import ServerError
-from flows.serve.place import Place, connected, default_place
+from flows.serve.place import QUIET, URL, Place, check_answers, client_environment, connected, default_place
 
 console = Console()
 
@@ -29,7 +29,9 @@ def server(
     port: Annotated[int, typer.Option(min=1, max=65535, help="port to listen on")] = 4200,
     database_url: Annotated[
         str | None,
-        typer.Option(envvar="AHOY_DATABASE_URL", show_envvar=True, help="a Postgres of your own, as postgresql+asyncpg://..."),
+        typer.Option(
+            envvar="AHOY_DATABASE_URL", show_envvar=True, help="a Postgres of your own, as postgresql+asyncpg://..."
+        ),
     ] = None,
     auth: Annotated[bool, typer.Option(help="ask for the password; without it only this machine may connect")] = True,
     gpus: Gpus = 1,
@@ -59,19 +61,23 @@ def server(
 
 def worker(
     limit: Annotated[int, typer.Option("--limit", "-n", min=1, help="videos at a time")] = 1,
-    pool: Annotated[str, typer.Option(help="work pool")] = "ahoy",
     name: Annotated[str | None, typer.Option(help="name in Prefect's pages")] = None,
     data: Data = None,
 ) -> None:
     """Work on videos as they are submitted; start as many as you like, here or on other machines."""
-    place = _place(data)
     try:
-        with connected(place) as url:
-            _set_environment(place)
-            from flows.serve.worker import work
+        environment = client_environment(_place(data))
+        check_answers(environment)
+    except ServerError as error:
+        _fail(str(error))
+    # Before Prefect is imported, which reads its settings then; runs inherit them.
+    os.environ.update({**QUIET, **environment})
+    from flows.serve.install import FEED_POOL, POOL
+    from flows.serve.worker import FEEDERS, work
 
-            console.print(f"working for {url}, {limit} at a time; Ctrl-C stops", soft_wrap=True, highlight=False)
-            work(pool, limit, name)
+    console.print(f"working for {environment[URL]}, {limit} at a time; Ctrl-C stops", soft_wrap=True, highlight=False)
+    try:
+        work({POOL: limit, FEED_POOL: FEEDERS}, name)
     except ServerError as error:
         _fail(str(error))
 
@@ -91,13 +97,6 @@ def _install(place: Place, gpus: int, downloads: int) -> None:
         from flows.serve.install import install as install_all
 
         asyncio.run(install_all(Installation(Limits(gpus, downloads))))
-
-
-def _set_environment(place: Place) -> None:
-    """Hand the address to child processes, which inherit the environment and not the settings of this one."""
-    from flows.serve.place import client_environment
-
-    os.environ.update(client_environment(place))
 
 
 def _place(data: Path | None) -> Place:

@@ -1,1 +1,1 @@
-"""What `ahoy server` and `ahoy worker` start on one machine: Postgres, Prefect's server, and what is installed in it."""
+"""What `ahoy server` and `ahoy worker` start: Postgres, Prefect's server, what is installed in it, and workers."""

@@ -8,7 +8,7 @@ from datetime import timedelta
 from typing import Any
 
 from prefect.client.orchestration import PrefectClient, get_client
-from prefect.client.schemas.actions import WorkPoolCreate, WorkPoolUpdate
+from prefect.client.schemas.actions import WorkPoolCreate
 from prefect.events.actions import ChangeFlowRunState
 from prefect.events.schemas.automations import AutomationCore, EventTrigger, Posture
 from prefect.exceptions import ObjectNotFound
@@ -17,8 +17,10 @@ from prefect.utilities.importtools import import_object
 from prefect.workers.process import ProcessWorker
 
 POOL = "ahoy"
+FEED_POOL = "ahoy-feed"  # of its own: a feeder that waited behind the videos it has to create would wait for ever
 DEPLOYMENT = "ahoy"
 PROCESS_VIDEO, FEED_BATCH = "process-video", "feed-batch"
+POOLS: Mapping[str, str] = {PROCESS_VIDEO: POOL, FEED_BATCH: FEED_POOL}
 ENTRYPOINTS: Mapping[str, str] = {
     PROCESS_VIDEO: "flows.process_video.process_video",
     FEED_BATCH: "flows.feed_batch.feed_batch",
@@ -43,37 +45,34 @@ class Installation:
     Attributes:
         limits: slots.
         entrypoints: flow name -> import path of the flow; both are deployed under the name `ahoy`.
-        environment: what the processes of the runs get beside the worker's own environment.
     """
 
     limits: Limits = Limits()
     entrypoints: Mapping[str, str] = field(default_factory=lambda: ENTRYPOINTS)
-    environment: Mapping[str, str] = field(default_factory=dict)
 
 
 async def install(installation: Installation = Installation()) -> None:
     """Create or update everything in the server that the client's settings name."""
     async with get_client() as client:
-        await _pool(client, installation.environment)
+        for pool in POOLS.values():
+            await _pool(client, pool)
         for name, slots in vars(installation.limits).items():
             await client.upsert_global_concurrency_limit_by_name(name, slots)
-        for entrypoint in installation.entrypoints.values():
-            await _deployment(client, entrypoint)
+        for flow, entrypoint in installation.entrypoints.items():
+            await _deployment(client, entrypoint, POOLS[flow])
         await _automation(client)
 
 
-async def _pool(client: PrefectClient, environment: Mapping[str, str]) -> None:
-    template = ProcessWorker.get_default_base_job_template()
-    template["variables"]["properties"]["env"]["default"] = dict(environment)
+async def _pool(client: PrefectClient, name: str) -> None:
+    """Create a pool unless it is there: its owner may have given it another type or template."""
     try:
-        await client.read_work_pool(POOL)
+        await client.read_work_pool(name)
     except ObjectNotFound:
-        await client.create_work_pool(WorkPoolCreate(name=POOL, type="process", base_job_template=template))
-    else:
-        await client.update_work_pool(POOL, WorkPoolUpdate(base_job_template=template))
+        template = ProcessWorker.get_default_base_job_template()
+        await client.create_work_pool(WorkPoolCreate(name=name, type="process", base_job_template=template))
 
 
-async def _deployment(client: PrefectClient, entrypoint: str) -> None:
+async def _deployment(client: PrefectClient, entrypoint: str, pool: str) -> None:
     flow: Any = import_object(entrypoint)
     flow_id = await client.create_flow(flow)
     await client.create_deployment(
@@ -83,7 +82,7 @@ async def _deployment(client: PrefectClient, entrypoint: str) -> None:
         entrypoint=entrypoint,
         path=None,
         pull_steps=None,
-        work_pool_name=POOL,
+        work_pool_name=pool,
         parameter_openapi_schema=_schema(flow),
         enforce_parameter_schema=True,
         tags=["ahoy"],
@@ -97,17 +96,19 @@ def _schema(flow: Any) -> Any:
 
 
 async def _automation(client: PrefectClient) -> None:
-    """Mark runs Crashed that sent a heartbeat and then, without having ended, none for `SILENT_S`."""
-    ends = {f"prefect.flow-run.{state}" for state in ("Completed", "Failed", "Cancelled", "Crashed")}
-    waits = {f"prefect.flow-run.{state}" for state in ("AwaitingRetry", "Paused", "Suspended", "Scheduled")}
+    """Mark runs Crashed that began and then, without having ended, sent no heartbeat for `SILENT_S`."""
+    ends = ("Completed", "Failed", "TimedOut", "Cancelled", "Crashed")
+    waits = ("AwaitingRetry", "Paused", "Suspended", "Scheduled", "Pending")
+    signs = {_HEARTBEAT} | {f"prefect.flow-run.{state}" for state in (*ends, *waits)}
     wanted = AutomationCore(
         name=AUTOMATION,
         description="A worker that dies with its run tells nobody. Ahoy's flows send a heartbeat every 30 s.",
         trigger=EventTrigger(
             posture=Posture.Proactive,
-            after={_HEARTBEAT},
-            expect={_HEARTBEAT} | ends | waits,
-            match={"prefect.resource.id": "prefect.flow-run.*"},  # type: ignore[arg-type]
+            after={_HEARTBEAT, "prefect.flow-run.Running"},
+            expect=signs,
+            match={"prefect.resource.id": "prefect.flow-run.*"},
+            match_related={"prefect.resource.role": "flow", "prefect.resource.name": list(POOLS)},
             for_each={"prefect.resource.id"},
             threshold=1,
             within=timedelta(seconds=SILENT_S),

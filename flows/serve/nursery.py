@@ -19,9 +19,16 @@ import sys
 import traceback
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
-PRELOADED = ("prefect.flow_engine", "prefect.deployments", "prefect.concurrency.sync", "flows.process_video", "flows.feed_batch")
+PRELOADED = (
+    "prefect.flow_engine",
+    "prefect.deployments",
+    "prefect.concurrency.sync",
+    "flows.process_video",
+    "flows.feed_batch",
+)
 READY = b"ready\n"
 
 
@@ -122,10 +129,8 @@ class Nursery:
                 return
             connection = self._runs.pop(pid)
             code = os.waitstatus_to_exitcode(status)
-            try:
+            with suppress(OSError):
                 connection.send(struct.pack("!i", code))
-            except OSError:
-                pass
             if connection in [key.fileobj for key in self._selector.get_map().values()]:
                 self._selector.unregister(connection)
             connection.close()

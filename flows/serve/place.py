@@ -21,7 +21,9 @@ QUIET = {
     "DO_NOT_TRACK": "1",
     "PREFECT_SERVER_UI_SHOW_PROMOTIONAL_CONTENT": "false",
 }
-_ROOT_FOLDER = Path("/var/lib/ahoy/server")  # Postgres, which refuses to run as root, can enter it; it cannot enter /root
+_ROOT_FOLDER = Path(
+    "/var/lib/ahoy/server"
+)  # Postgres, which refuses to run as root, can enter it; it cannot enter /root
 
 
 @dataclass(frozen=True)

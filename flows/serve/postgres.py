@@ -45,8 +45,8 @@ class Postgres:
         if self.running():
             return
         if not (self.folder / "PG_VERSION").exists():
-            options = ["--auth=trust", "--encoding=utf8", "--locale=C", "--username=postgres"]
-            self._run("initdb", "-D", str(self.folder), *options)
+            fixed = ["--auth=trust", "--encoding=utf8", "--locale=C", "--username=postgres"]
+            self._run("initdb", "-D", str(self.folder), *fixed)
         options = f"-c listen_addresses='' -c unix_socket_permissions=0700 -k '{self._socket_folder()}'"
         log = str(self.folder / "log")
         self._run("pg_ctl", "-D", str(self.folder), "-w", "-t", str(START_S), "-l", log, "-o", options, "start")
@@ -100,7 +100,8 @@ class Postgres:
         done = self._call(program, *arguments)
         if done.returncode != 0:
             log = self.folder / "log"
-            said = "\n".join([done.stderr.strip(), *(log.read_text(errors="replace").splitlines()[-5:] if log.exists() else [])])
+            tail = log.read_text(errors="replace").splitlines()[-5:] if log.exists() else []
+            said = "\n".join([done.stderr.strip(), *tail])
             raise ServerError(f"PostgreSQL's {program} failed on {self.folder}:\n{said.strip()}")
 
     def _call(self, program: str, *arguments: str) -> subprocess.CompletedProcess[str]:

@@ -1,6 +1,6 @@
 """Stands in for one flow run's process: asks the nursery for it, passes signals on, ends as it ends.
 
-Run by path, with the standard library alone (`python -I -S relay.py SOCKET`), since a run costs what this costs to start.
+Run by path, with the standard library alone (`python -I -S relay.py SOCKET`): every run waits for this to start.
 The worker sees an ordinary child process. If it is killed, its connection breaks and the nursery kills the run.
 """
 
@@ -18,7 +18,7 @@ def main() -> int:
     connection.connect(sys.argv[1])
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         signal.signal(number, lambda got, frame: connection.send(bytes([got])))
-    order = json.dumps({"environment": dict(os.environ), "folder": os.getcwd()}).encode()
+    order = json.dumps({"environment": dict(os.environ), "folder": os.getcwd()}).encode()  # noqa: PTH109 - pathlib costs time
     connection.sendall(struct.pack("!I", len(order)) + order)
     answer = connection.recv(4)
     if len(answer) < 4:

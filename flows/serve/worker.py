@@ -6,13 +6,14 @@ import asyncio
 import os
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 from prefect.utilities.processutils import command_to_string
 from prefect.workers.process import ProcessJobConfiguration, ProcessWorker
@@ -20,8 +21,11 @@ from prefect.workers.process import ProcessJobConfiguration, ProcessWorker
 from flows.serve import nursery, relay
 from flows.serve.errors import ServerError
 
-HEARTBEAT_S = 30  # the shortest that Prefect allows
-QUERY_S = 2.0  # how often an idle worker asks for work
+SETTINGS = {
+    "PREFECT_FLOWS_HEARTBEAT_FREQUENCY": "30",  # seconds; the shortest that Prefect allows
+    "PREFECT_WORKER_QUERY_SECONDS": "2",  # how often an idle worker asks for work
+}
+FEEDERS = 4  # batches that one worker feeds at a time, beside its videos: feeding is light
 _SOCKET = "AHOY_NURSERY"
 
 
@@ -40,16 +44,19 @@ class WarmWorker(ProcessWorker):
     """A process worker with warm starts."""
 
     type = "process"
-    job_configuration: ClassVar[type[ProcessJobConfiguration]] = WarmJobConfiguration  # type: ignore[misc]
+    job_configuration = WarmJobConfiguration
 
 
 @contextmanager
 def running_nursery() -> Iterator[None]:
-    """Start the nursery and name its socket in the environment.
+    """Start the nursery and name its socket in the environment; one that is named there already is shared.
 
     Raises:
         ServerError: it did not come up.
     """
+    if _SOCKET in os.environ:
+        yield
+        return
     folder = Path(tempfile.mkdtemp(prefix="ahoy-worker-"))
     path = folder / "socket"
     command = [sys.executable, "-m", nursery.__name__, str(path)]
@@ -68,31 +75,23 @@ def running_nursery() -> Iterator[None]:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def work(pool: str, limit: int, name: str | None) -> None:
-    """Take runs from a pool until interrupted (SIGINT or SIGTERM); runs at work are then told to stop.
+def work(pools: Mapping[str, int], name: str | None) -> None:
+    """Take runs until interrupted (SIGINT or SIGTERM); runs at work are then told to stop.
 
     Args:
-        pool: name of the work pool.
-        limit: how many runs at a time.
-        name: of the worker in Prefect's pages; by default Prefect makes one up.
+        pools: name of a work pool -> how many of its runs at a time.
+        name: of the worker in Prefect's pages; by default the machine's and the process's.
     """
-    os.environ.setdefault("PREFECT_FLOWS_HEARTBEAT_FREQUENCY", str(HEARTBEAT_S))
-    with running_nursery() if hasattr(os, "fork") and sys.platform != "darwin" else _nothing():
-        asyncio.run(_work(pool, limit, name))
+    warm = hasattr(os, "fork") and sys.platform != "darwin"  # macOS's own libraries do not survive a fork
+    with running_nursery() if warm else nullcontext():
+        asyncio.run(_work(pools, name or f"{socket.gethostname()}-{os.getpid()}"))
 
 
-async def _work(pool: str, limit: int, name: str | None) -> None:
-    worker = WarmWorker(work_pool_name=pool, limit=limit, name=name, create_pool_if_not_found=False)
-    task = asyncio.ensure_future(worker.start())
+async def _work(pools: Mapping[str, int], name: str) -> None:
+    workers = [WarmWorker(work_pool_name=pool, limit=limit, name=name) for pool, limit in pools.items()]
+    task = asyncio.gather(*(worker.start() for worker in workers))
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, task.cancel)
-    try:
+    with suppress(asyncio.CancelledError):
         await task
-    except asyncio.CancelledError:
-        pass
-
-
-@contextmanager
-def _nothing() -> Iterator[None]:
-    yield
