@@ -104,9 +104,7 @@ def status(
 def rerun(
     batch: BatchName,
     store: Store,
-    failed: Annotated[
-        bool, typer.Option("--failed", help="only what failed, not what crashed or was cancelled")
-    ] = False,
+    failed: Annotated[bool, typer.Option("--failed", help="only failed ones, not crashed or cancelled")] = False,
     stage: Annotated[str | None, typer.Option(help="only what ended at this stage")] = None,
     error: Annotated[str | None, typer.Option(help="only what ended with this class of error")] = None,
     videos: Videos = None,

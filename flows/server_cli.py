@@ -34,6 +34,7 @@ def server(
         ),
     ] = None,
     auth: Annotated[bool, typer.Option(help="ask for the password; without it only this machine may connect")] = True,
+    installs: Annotated[bool, typer.Option("--install/--no-install", help="install what Ahoy needs in it")] = True,
     gpus: Gpus = 1,
     downloads: Downloads = 4,
 ) -> None:
@@ -47,7 +48,8 @@ def server(
 
     def ready(running: PrefectServer) -> None:
         os.environ.update(running.client())
-        _install(place, gpus, downloads)
+        if installs:
+            _install(place, gpus, downloads)
         console.print(f"Prefect's pages: {running.url.removesuffix('/api')}", soft_wrap=True, highlight=False)
         if auth:
             console.print(f"password: in {place.folder / 'auth'}", soft_wrap=True, highlight=False)

@@ -23,7 +23,7 @@ async def batch_logs(queue: Queue, videos: Collection[str]) -> AsyncIterator[str
         offset = 0
         while True:
             page = await queue.client.read_logs(
-                LogFilter(flow_run_id=LogFilterFlowRunId(any_=[seen.flow_run_id])),  # type: ignore[list-item]
+                LogFilter(flow_run_id=LogFilterFlowRunId(any_=[seen.flow_run_id])),
                 limit=PAGE,
                 offset=offset,
                 sort=LogSort.TIMESTAMP_ASC,

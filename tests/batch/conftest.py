@@ -58,9 +58,10 @@ class Server:
     workers: list[subprocess.Popen[Any]] = field(default_factory=list)
 
     def start(self) -> None:
-        command = [sys.executable, "-m", "tests.batch.serve", str(self.place.folder), str(self.port)]
+        options = ["--no-install", "--data", str(self.place.folder), "--port", str(self.port)]
+        command = [sys.executable, "-m", "flows", "server", *options]
         self.process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
-        assert self.process.stdout is not None and self.process.stdout.readline() == "ready\n"
+        assert self.process.stdout is not None and self.process.stdout.readline().startswith("Prefect's pages")
 
     def stop(self) -> None:
         assert self.process is not None
