@@ -16,15 +16,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 from prefect.client.orchestration import SyncPrefectClient, get_client
 from prefect.client.schemas.filters import FlowRunFilter, FlowRunFilterTags
-from prefect.client.schemas.objects import FlowRun
+from prefect.client.schemas.objects import TERMINAL_STATES, FlowRun
 
 from flows.batch.plan import SeenRun
 from flows.batch.queue import seen_run
 from flows.serve import nursery
-from flows.serve.install import ENTRYPOINTS, PROCESS_VIDEO, Installation, install
+from flows.serve.install import ENTRYPOINTS, FEED_BATCH, PROCESS_VIDEO, Installation, install
 from flows.serve.place import QUIET, Place, client_environment, connected
 from flows.serve.worker import SETTINGS
 
@@ -96,8 +97,34 @@ class Server:
         names = {"process-video": True, "feed-batch": False}
         return [run for run in found if (seen_run(run) is not None) == names[flow]]
 
+    def live_feeders(self, batch: str) -> list[FlowRun]:
+        return [run for run in self.runs(batch, FEED_BATCH) if run.state_type not in TERMINAL_STATES]
+
+    def feeder_pid(self, batch: str) -> int:
+        """The process that the worker sees of what feeds a batch; killing it kills the feeder."""
+        run = str(wait_for(lambda: self.live_feeders(batch), "a feeder")[0].id)
+        return next(p.pid for p in psutil.process_iter() if _environment(p).get("PREFECT__FLOW_RUN_ID") == run)
+
+    def prefect_pid(self) -> int:
+        return int((self.place.folder / "prefect.pid").read_text())
+
+    def answers(self) -> bool:
+        """Whether the server can read its database."""
+        try:
+            self.runs("none")
+        except Exception:
+            return False
+        return True
+
     def seen(self, batch: str) -> list[SeenRun]:
         return [seen for run in self.runs(batch) if (seen := seen_run(run)) is not None]
+
+
+def _environment(process: psutil.Process) -> dict[str, str]:
+    try:
+        return process.environ()
+    except psutil.Error:
+        return {}
 
 
 @pytest.fixture(scope="session")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from typer.testing import CliRunner, Result
 
@@ -54,7 +55,18 @@ class Batch:
 
         wait_for(ended, f"the end of {self.name}", limit_s)
 
+    def again_until_ended(self) -> None:
+        """Submit once more where the feeder may have ended with its worker, and wait."""
+        self.submit()
+        self.wait_ended()
+
+    def rerun(self, *words: str) -> str:
+        return self.ahoy("rerun", self.name, "--poll", "0.3", *words).output
+
+    def rows(self, table: str) -> list[dict[str, Any]]:
+        rows: list[dict[str, Any]] = self.tables.read(table, self.name).to_pylist()
+        return rows
+
     def attempts(self, name: str) -> list[tuple[int, str]]:
-        rows = self.tables.read("attempts", self.name).to_pylist()
-        mine = [row for row in rows if row["video_id"].startswith(f"{name}-")]
+        mine = [row for row in self.rows("attempts") if row["video_id"].startswith(f"{name}-")]
         return sorted({(row["attempt_number"], row["state"]) for row in mine})

@@ -1,7 +1,7 @@
 """Three stages that do nothing but what their video tells them, in the real flow, on a real server and real workers.
 
 A toy video is a JSON file: its name, and per stage what the first, second, ... execution does: `ok`, `hold` (until a
-file appears), `die` (SIGKILL), `crash` (a segmentation fault), `bad` (bad input), `break` (a lost connection), `bug`.
+file appears), `nap`, `die` (SIGKILL), `crash` (a segmentation fault), `bad` (bad input), `break` (a lost connection), `bug`.
 Each execution leaves a line in `<video>.effects` before it starts and one when it is done, so that tests can count.
 """
 
@@ -49,7 +49,7 @@ class Toy:
         self.path.with_suffix(".go").touch()
 
     def lines(self) -> list[list[str]]:
-        """Stage, `start` or `made`, process id: in the order in which they happened."""
+        """Stage, `start` or `made`, process id, time: in the order in which they happened."""
         return [line.split() for line in self.effects.read_text().splitlines()] if self.effects.exists() else []
 
     def count(self, what: str) -> Counter[str]:
@@ -67,7 +67,7 @@ def _note(script: dict[str, Any], stage: str, what: str) -> int:
     path = Path(script["effects"])
     before = Toy(path.with_suffix(".mp4")).count("start")[stage]
     with path.open("a") as file:
-        file.write(f"{stage} {what} {os.getpid()}\n")
+        file.write(f"{stage} {what} {os.getpid()} {time.time():.6f}\n")
     return before
 
 
@@ -76,6 +76,8 @@ def _act(action: str, script: dict[str, Any]) -> None:
         deadline = time.monotonic() + HELD_S
         while not Path(script["effects"]).with_suffix(".go").exists() and time.monotonic() < deadline:
             time.sleep(0.02)
+    elif action == "nap":
+        time.sleep(0.5)
     elif action == "die":
         os.kill(os.getpid(), signal.SIGKILL)
     elif action == "crash":
