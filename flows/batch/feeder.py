@@ -76,13 +76,13 @@ class Feeder:
     async def reconcile(self) -> None:
         """File videos as crashed that the ledger believes at work while nobody is."""
         dead = died_silently(self.status().records, await self.queue.seen())
-        rows = [
-            attempt_row(record.video_id, record.attempt_number, CRASHED_SEQUENCE, "crashed")
-            | {"run_id": record.run_id or "", "stage": record.stage, "error_class": "Crashed"}
-            for record in dead
-        ]
-        if rows:
-            self._tables.append("attempts", rows, batch=self.queue.batch)
+        self._append(
+            [
+                attempt_row(record.video_id, record.attempt_number, CRASHED_SEQUENCE, "crashed")
+                | {"run_id": record.run_id or "", "stage": record.stage, "error_class": "Crashed"}
+                for record in dead
+            ]
+        )
 
     async def feed(self, chosen: Collection[str] | None) -> Counter[str]:
         """Work until every video has ended, or the batch is cancelled.
@@ -127,24 +127,32 @@ class Feeder:
 
     async def _end(self, todo: Plan, run: FlowRun) -> None:
         work, state = todo.live[str(run.id)], run_state(run)
-        if state == "crashed":
-            if await self._file_crash(work, run) and (next_try := todo.after_crash(work)):
-                todo.due.append(next_try)
+        if state == "crashed" and not self._is_done(work):
+            next_try = todo.after_crash(work)
+            self._append([await self._crash(work, run), *([_announced(next_try)] if next_try else [])])
+            todo.due += [next_try] if next_try else []
         elif state == "cancelled":
-            self._append(work, CRASHED_SEQUENCE, "cancelled", {})
+            self._append([attempt_row(work.video_id, work.attempt, CRASHED_SEQUENCE, "cancelled")])
         self.ended[state] += 1
         del todo.live[str(run.id)]
 
-    async def _file_crash(self, work: Work, run: FlowRun) -> bool:
-        """Write the row that the dead run could not; False if its video got done all the same."""
-        sequence = max(run.run_count, 1) * SEQUENCE_STEP - 1
-        message = run.state.message if run.state and run.state.message else "the process ended without a word"
-        error = {"error_class": "Crashed", "error_message": message}
-        more = {"stage": await self.queue.stage_of(run), "flow_run_id": str(run.id), **error}
-        self._append(work, sequence, "crashed", more)
-        self.log.warning("%s #%d crashed at %s: %s", work.video_id, work.attempt, more["stage"], message)
+    def _is_done(self, work: Work) -> bool:
+        """Whether a run got its video done and died after it had said so."""
         mine = [("video_id", "==", work.video_id), ("attempt_number", "==", work.attempt), ("state", "==", "done")]
-        return self._tables.read("attempts", self.queue.batch, filters=mine).num_rows == 0
+        return self._tables.read("attempts", self.queue.batch, filters=mine).num_rows > 0
+
+    async def _crash(self, work: Work, run: FlowRun) -> dict[str, Any]:
+        """The row that the dead run could not write."""
+        message = run.state.message if run.state and run.state.message else "the process ended without a word"
+        stage = await self.queue.stage_of(run)
+        self.log.warning("%s #%d crashed at %s: %s", work.video_id, work.attempt, stage, message)
+        sequence = max(run.run_count, 1) * SEQUENCE_STEP - 1
+        return attempt_row(work.video_id, work.attempt, sequence, "crashed") | {
+            "stage": stage,
+            "flow_run_id": str(run.id),
+            "error_class": "Crashed",
+            "error_message": message,
+        }
 
     async def _top_up(self, todo: Plan) -> None:
         room = max(0, self.outstanding - await self.queue.count_live()) if todo.due else 0
@@ -152,8 +160,7 @@ class Feeder:
         if not work:
             return
         # Announced first: the ledger knows of every try, even one whose run was never created.
-        rows = [attempt_row(item.video_id, item.attempt, -1, "scheduled") for item in work]
-        self._tables.append("attempts", rows, batch=self.queue.batch)
+        self._append([_announced(item) for item in work])
         entries = {entry.video_id: entry for entry in self._manifest.entries}
         url = self.store.url
         parameters = [video_parameters(self._manifest, entries[w.video_id], w.attempt, url) for w in work]
@@ -161,9 +168,9 @@ class Feeder:
             todo.live[str(run.id)] = item
         del todo.due[: len(work)]
 
-    def _append(self, work: Work, sequence: int, state: str, more: dict[str, Any]) -> None:
-        row = attempt_row(work.video_id, work.attempt, sequence, state) | more
-        self._tables.append("attempts", [row], batch=self.queue.batch)
+    def _append(self, rows: list[dict[str, Any]]) -> None:
+        if rows:
+            self._tables.append("attempts", rows, batch=self.queue.batch)
 
     def _stuck(self, run: FlowRun, now: datetime) -> bool:
         return (
@@ -171,3 +178,7 @@ class Feeder:
             and run.state is not None
             and run.state.timestamp < now - timedelta(seconds=self.pending_s)
         )
+
+
+def _announced(work: Work) -> dict[str, Any]:
+    return attempt_row(work.video_id, work.attempt, -1, "scheduled")

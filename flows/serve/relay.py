@@ -26,7 +26,8 @@ def main() -> int:
         return 1
     status: int = struct.unpack("!i", answer)[0]
     if status < 0:
-        signal.signal(-status, signal.SIG_DFL)
+        if -status != signal.SIGKILL:
+            signal.signal(-status, signal.SIG_DFL)
         os.kill(os.getpid(), -status)
     return status
 

@@ -10,6 +10,7 @@ import socket
 import subprocess
 import sys
 import tempfile
+import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
@@ -40,11 +41,14 @@ class WarmJobConfiguration(ProcessJobConfiguration):
         super().prepare_for_flow_run(*arguments, **named)
 
 
-class WarmWorker(ProcessWorker):
-    """A process worker with warm starts."""
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore")  # Prefect remarks that this replaces its own process worker, which is meant
 
-    type = "process"
-    job_configuration = WarmJobConfiguration
+    class WarmWorker(ProcessWorker):
+        """A process worker with warm starts."""
+
+        type = "process"
+        job_configuration = WarmJobConfiguration
 
 
 @contextmanager

@@ -1,7 +1,7 @@
 """Three stages that do nothing but what their video tells them, in the real flow, on a real server and real workers.
 
 A toy video is a JSON file: its name, and per stage what the first, second, ... execution does: `ok`, `hold` (until a
-file appears), `nap`, `die` (SIGKILL), `crash` (a segmentation fault), `bad` (bad input), `break` (a lost connection), `bug`.
+file appears), `nap`, `die` (SIGKILL), `crash` (a segmentation fault), `bad` (input), `break` (a connection), `bug`.
 Each execution leaves a line in `<video>.effects` before it starts and one when it is done, so that tests can count.
 """
 
