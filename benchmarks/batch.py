@@ -55,8 +55,15 @@ class Bench:
 
     folder: Path
     server: psutil.Process
-    worker: psutil.Popen
     store: ArtifactStore
+    started: psutil.Popen | None = None
+
+    @property
+    def worker(self) -> psutil.Popen:
+        """The worker; started with the first batch that is fed: runs have to wait while their creation is timed."""
+        if self.started is None:
+            self.started = _worker(self.folder)
+        return self.started
 
     def batch(self, name: str, videos: int, text: str = "") -> BatchManifest:
         """A batch of files, each with content of its own."""
@@ -70,7 +77,8 @@ class Bench:
         return submit(self.store, BatchManifest.of(name, entries, {"preset": "draft"}))[0]
 
     def feed(self, batch: str, **more: Any) -> None:
-        """Start a feeder and wait until the batch has ended."""
+        """Start a feeder, and the worker if there is none."""
+        assert self.worker.is_running()
         request = FeedRequest(store=self.store.url, batch=batch, poll_s=1.0, outstanding=50, **more)
         _with_queue(self.store, batch, lambda queue: start_feeder(queue, request))
 
@@ -112,18 +120,18 @@ def running() -> Iterator[Bench]:
     port = _free_port()
     command = [sys.executable, "-m", "flows", "server", "--no-install", "--data", str(folder), "--port", str(port)]
     server = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE)
-    worker = None
+    bench = None
     try:
         assert server.stdout is not None and server.stdout.readline().startswith(b"Prefect's pages")
         with connected(Place(folder)):
             entrypoints = {**ENTRYPOINTS, PROCESS_VIDEO: "benchmarks.noop.process_video"}
             asyncio.run(install(Installation(entrypoints=entrypoints)))
-            worker = _worker(folder)
-            yield Bench(folder, psutil.Process(_prefect_pid(folder)), worker, ArtifactStore(folder / "store"))
+            bench = Bench(folder, psutil.Process(_prefect_pid(folder)), ArtifactStore(folder / "store"))
+            yield bench
     finally:
-        if worker is not None:
-            worker.terminate()
-            worker.wait()
+        if bench is not None and bench.started is not None:
+            bench.started.terminate()
+            bench.started.wait()
         server.terminate()
         server.wait()
         shutil.rmtree(folder)
@@ -158,8 +166,7 @@ def submit_rate(bench: Bench, runs: int) -> dict[str, float]:
         started = time.perf_counter()
         await queue.create(work, parameters)
         elapsed = time.perf_counter() - started
-        async for run in queue.runs(live=True):
-            await queue.cancel(run)
+        await queue.cancel([run async for run in queue.runs(live=True)])
         return elapsed
 
     cpu = bench.server.cpu_times()

@@ -148,8 +148,7 @@ def cancel(batch: BatchName, store: Store, reason: Annotated[str, typer.Option(h
 
         async def stop(queue: Queue) -> int:
             runs = [run for flow in (FEED_BATCH, PROCESS_VIDEO) async for run in queue.runs(flow, live=True)]
-            for run in runs:
-                await queue.cancel(run)
+            await queue.cancel(runs)
             return len(runs)
 
         console.print(f"{_with_queue(opened, batch, stop)} runs told to stop")

@@ -88,9 +88,10 @@ class PrefectObserver:
                 pictures, key="overview", description="the body on the video, and the avatar from all sides"
             )
         for stage, name in LINKS:
-            if stage in manifests:
-                link = f"{run.store.url}/{manifests[stage].blob(name).path}"
-                create_link_artifact(link, link_text=name, key=_key(name), description=f"{name} in the store")
+            for blob in manifests[stage].blobs if stage in manifests else ():
+                if blob.name == name:
+                    link = f"{run.store.url}/{blob.path}"
+                    create_link_artifact(link, link_text=name, key=_key(name), description=f"{name} in the store")
 
 
 def _stage_rows(outcome: Outcome) -> list[dict[str, Any]]:

@@ -164,8 +164,8 @@ class Feeder:
         entries = {entry.video_id: entry for entry in self._manifest.entries}
         url = self.store.url
         parameters = [video_parameters(self._manifest, entries[w.video_id], w.attempt, url) for w in work]
-        for item, run in zip(work, await self.queue.create(work, parameters), strict=True):
-            todo.live[str(run.id)] = item
+        for item, run_id in zip(work, await self.queue.create(work, parameters), strict=True):
+            todo.live[run_id] = item
         del todo.due[: len(work)]
 
     def _append(self, rows: list[dict[str, Any]]) -> None:

@@ -30,7 +30,8 @@ from flows.batch.plan import RunState, SeenRun, Work
 from flows.serve.install import DEPLOYMENT, FEED_BATCH, PROCESS_VIDEO
 
 PAGE = 200  # the most that Prefect lists at a time
-SIDE_BY_SIDE = 8  # requests under way when runs are created
+AT_ONCE = 50  # runs created by one request; Prefect takes up to 100
+SIDE_BY_SIDE = 8  # requests under way when runs are cancelled
 _LIVE = [state for state in StateType if state not in TERMINAL_STATES]
 _STATES: dict[StateType, RunState] = {
     StateType.COMPLETED: "done",
@@ -38,6 +39,10 @@ _STATES: dict[StateType, RunState] = {
     StateType.CRASHED: "crashed",
     StateType.CANCELLED: "cancelled",
 }
+
+
+class QueueError(RuntimeError):
+    """Prefect's server does not take what the queue asks for."""
 
 
 @dataclass(frozen=True)
@@ -111,23 +116,44 @@ class Queue:
             flow_filter=FlowFilter(name=FlowFilterName(any_=[PROCESS_VIDEO])), flow_run_filter=self._filter(True)
         )
 
-    async def create(self, work: Sequence[Work], parameters: Sequence[dict[str, Any]]) -> list[FlowRun]:
-        """Create the runs of these tries; one that exists already is returned instead."""
+    async def create(self, work: Sequence[Work], parameters: Sequence[dict[str, Any]]) -> list[str]:
+        """Create the runs of these tries, many to a request.
+
+        Args:
+            work: the tries.
+            parameters: of each, the fields of a `VideoRequest`.
+
+        Returns:
+            Ids of the runs; one that existed already is named instead of doubled.
+
+        Raises:
+            QueueError: the server refused one, since its parameters do not fit the deployment.
+        """
         deployment = await self.deployment(PROCESS_VIDEO)
-        gate = asyncio.Semaphore(SIDE_BY_SIDE)
+        ids: list[str] = []
+        for start in range(0, len(work), AT_ONCE):
+            pairs = zip(work[start : start + AT_ONCE], parameters[start : start + AT_ONCE], strict=True)
+            answer = await self.client.request(
+                "POST",
+                "/deployments/{id}/create_flow_run/bulk",  # type: ignore[arg-type]
+                path_params={"id": deployment},
+                json=[self._run(item, request) for item, request in pairs],
+            )
+            for result in answer.json()["results"]:
+                if result["status"] != "CREATED":
+                    raise QueueError(f"the server refused a run: {result['error']}; run `ahoy install` once more")
+                ids.append(result["flow_run_id"])
+        return ids
 
-        async def one(item: Work, request: dict[str, Any]) -> FlowRun:
-            async with gate:
-                return await self.client.create_flow_run_from_deployment(
-                    deployment,
-                    parameters={"request": request},
-                    name=f"{item.video_id} #{item.attempt}",
-                    tags=[*self.tags, f"video:{item.video_id}"],
-                    # Without the attempt in it a rerun would silently get the finished run back.
-                    idempotency_key=f"{self._store_id}/{self.batch}/{item.video_id}/{item.attempt}",
-                )
-
-        return list(await asyncio.gather(*map(one, work, parameters)))
+    def _run(self, item: Work, request: dict[str, Any]) -> dict[str, Any]:
+        return {
+            "parameters": {"request": request},
+            "name": f"{item.video_id} #{item.attempt}",
+            "tags": [*self.tags, f"video:{item.video_id}"],
+            "state": {"type": "SCHEDULED"},
+            # Without the attempt in it a rerun would silently get the finished run back.
+            "idempotency_key": f"{self._store_id}/{self.batch}/{item.video_id}/{item.attempt}",
+        }
 
     async def start_feeder(self, request: dict[str, Any]) -> FlowRun:
         """Create a run of `feed-batch`."""
@@ -145,9 +171,15 @@ class Queue:
         """Say that a run is dead that cannot say so itself."""
         await self.client.set_flow_run_state(run.id, Crashed(message=why), force=True)
 
-    async def cancel(self, run: FlowRun) -> None:
-        """Stop a run: one that has not started is cancelled at once, one at work by its worker."""
-        await self.client.set_flow_run_state(run.id, Cancelling(message="the batch was cancelled"))
+    async def cancel(self, runs: Sequence[FlowRun]) -> None:
+        """Stop runs: those that have not started are cancelled at once, those at work by their workers."""
+        gate = asyncio.Semaphore(SIDE_BY_SIDE)
+
+        async def one(run: FlowRun) -> None:
+            async with gate:
+                await self.client.set_flow_run_state(run.id, Cancelling(message="the batch was cancelled"))
+
+        await asyncio.gather(*map(one, runs))
 
     async def stage_of(self, run: FlowRun) -> str | None:
         """The stage that a dead run was at."""

@@ -30,7 +30,7 @@ from flows.serve.place import QUIET, Place, client_environment, connected
 from flows.serve.worker import SETTINGS
 
 ROOT = Path(__file__).resolve().parents[2]
-READY_S = 150.0  # far more than anything takes; a test that waits so long has failed
+READY_S = 240.0  # far more than anything takes; a test that waits so long has failed
 
 
 def wait_for(condition: Callable[[], Any], what: str, limit_s: float = READY_S) -> Any:

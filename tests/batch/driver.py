@@ -12,7 +12,7 @@ from flows.cli import app
 from storage_schema.status import BatchStatus, VideoStatus, batch_status
 from storage_schema.store import ArtifactStore
 from storage_schema.tables import Tables
-from tests.batch.conftest import wait_for
+from tests.batch.conftest import READY_S, wait_for
 from tests.batch.toy import Toy
 
 
@@ -49,7 +49,7 @@ class Batch:
     def states(self) -> dict[str, int]:
         return {state: count for state, count in self.status().videos.items() if count}
 
-    def wait_ended(self, limit_s: float = 150.0) -> None:
+    def wait_ended(self, limit_s: float = READY_S) -> None:
         def ended() -> bool:
             return not {"waiting", "running"} & set(self.states())
 

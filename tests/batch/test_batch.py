@@ -185,8 +185,7 @@ def test_more_runs_than_a_page_are_listed(server: Server, tmp_path: Path) -> Non
             await queue.create(work[:10], requests[:10])
             listed = {seen.video_id async for run in queue.runs(live=True) if (seen := seen_run(run))}
             count = await queue.count_live()
-            async for run in queue.runs(live=True):
-                await queue.cancel(run)
+            await queue.cancel([run async for run in queue.runs(live=True)])
             return len(listed), count
 
     assert asyncio.run(create()) == (number, number)
