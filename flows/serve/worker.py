@@ -22,10 +22,6 @@ from prefect.workers.process import ProcessJobConfiguration, ProcessWorker
 from flows.serve import nursery, relay
 from flows.serve.errors import ServerError
 
-SETTINGS = {
-    "PREFECT_FLOWS_HEARTBEAT_FREQUENCY": "30",  # seconds; the shortest that Prefect allows
-    "PREFECT_WORKER_QUERY_SECONDS": "2",  # how often an idle worker asks for work
-}
 FEEDERS = 4  # batches that one worker feeds at a time, beside its videos: feeding is light
 _SOCKET = "AHOY_NURSERY"
 
