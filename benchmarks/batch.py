@@ -38,7 +38,6 @@ from flows.batch.submission import start_feeder
 from flows.feed_batch import FeedRequest
 from flows.serve.install import ENTRYPOINTS, PROCESS_VIDEO, Installation, install
 from flows.serve.place import Place, connected
-from flows.serve.worker import SETTINGS
 from storage_schema.batches import BatchEntry, BatchManifest, submit
 from storage_schema.status import batch_status
 from storage_schema.store import ArtifactStore
@@ -139,7 +138,7 @@ def running() -> Iterator[Bench]:
 
 def _worker(folder: Path) -> psutil.Popen:
     command = [sys.executable, "-m", "flows", "worker", "--limit", str(SLOTS), "--data", str(folder)]
-    environment = {**os.environ, **SETTINGS, "PYTHONPATH": str(ROOT)}
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     log = (folder / "worker.log").open("wb")
     return psutil.Popen(command, env=environment, cwd=ROOT, stdout=log, stderr=log, start_new_session=True)
 

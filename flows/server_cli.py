@@ -12,7 +12,16 @@ from rich.console import Console
 from rich.markup import escape
 
 from flows.serve.errors import ServerError
-from flows.serve.place import QUIET, URL, Place, check_answers, client_environment, connected, default_place
+from flows.serve.place import (
+    QUIET,
+    URL,
+    WORKER_SETTINGS,
+    Place,
+    check_answers,
+    client_environment,
+    connected,
+    default_place,
+)
 
 console = Console()
 
@@ -73,7 +82,7 @@ def worker(
     except ServerError as error:
         _fail(str(error))
     # Before Prefect is imported, which reads its settings then; runs inherit them.
-    os.environ.update({**QUIET, **environment})
+    os.environ.update({**WORKER_SETTINGS, **QUIET, **os.environ, **environment})
     from flows.serve.install import FEED_POOL, POOL
     from flows.serve.worker import FEEDERS, work
 

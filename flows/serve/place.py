@@ -21,9 +21,12 @@ QUIET = {
     "DO_NOT_TRACK": "1",
     "PREFECT_SERVER_UI_SHOW_PROMOTIONAL_CONTENT": "false",
 }
-_ROOT_FOLDER = Path(
-    "/var/lib/ahoy/server"
-)  # Postgres, which refuses to run as root, can enter it; it cannot enter /root
+WORKER_SETTINGS = {
+    "PREFECT_FLOWS_HEARTBEAT_FREQUENCY": "30",  # seconds; the shortest that Prefect allows
+    "PREFECT_WORKER_QUERY_SECONDS": "2",  # how often an idle worker asks for work
+}
+# Postgres refuses to run as root, and the user that it then runs as cannot enter /root.
+_ROOT_FOLDER = Path("/var/lib/ahoy/server")
 
 
 @dataclass(frozen=True)

@@ -26,8 +26,7 @@ from flows.batch.plan import SeenRun
 from flows.batch.queue import seen_run
 from flows.serve import nursery
 from flows.serve.install import ENTRYPOINTS, FEED_BATCH, PROCESS_VIDEO, Installation, install
-from flows.serve.place import QUIET, Place, client_environment, connected
-from flows.serve.worker import SETTINGS
+from flows.serve.place import QUIET, WORKER_SETTINGS, Place, client_environment, connected
 
 ROOT = Path(__file__).resolve().parents[2]
 READY_S = 240.0  # far more than anything takes; a test that waits so long has failed
@@ -81,7 +80,7 @@ class Server:
 
     def environment(self) -> dict[str, str]:
         own = {"AHOY_SERVER": str(self.place.folder), "AHOY_NURSERY": self.socket, "PYTHONPATH": str(ROOT)}
-        return {**os.environ, **SETTINGS, "PREFECT_WORKER_QUERY_SECONDS": "0.5", **own}
+        return {**os.environ, "PREFECT_WORKER_QUERY_SECONDS": "0.5", **own}
 
     def stop_workers(self) -> None:
         for process in self.workers:
@@ -155,7 +154,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
 
 def _nursery(server: Server) -> subprocess.Popen[bytes]:
     """One for all workers of the session: importing everything takes ten seconds."""
-    environment = {**server.environment(), **QUIET, **client_environment(server.place)}
+    environment = {**WORKER_SETTINGS, **server.environment(), **QUIET, **client_environment(server.place)}
     log = (server.place.logs / "nursery.log").open("wb")
     process = subprocess.Popen(
         [sys.executable, "-m", nursery.__name__, server.socket],
