@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import time
 from collections import Counter
 from collections.abc import Awaitable, Callable, Collection
 from dataclasses import dataclass, field
@@ -28,6 +29,7 @@ from storage_schema.store import ArtifactStore
 from storage_schema.tables import Tables
 
 TABLES = ("attempts", "stages", "frames", "metrics")
+SERVER_GONE_S = 900.0
 _AT_MOST = 50  # runs created between two looks at those under way
 _Logger = logging.Logger | logging.LoggerAdapter[Any]
 
@@ -94,7 +96,7 @@ class Feeder:
             How many runs ended in which state while this feeder watched.
         """
         todo: Plan | None = None
-        total = 0
+        total, answered = 0, time.monotonic()
         while todo is None or ((todo.due or todo.live) and not is_cancelled(self.store, self.queue.batch)):
             try:
                 if todo is None:
@@ -104,8 +106,11 @@ class Feeder:
                 await self._watch(todo)
                 await self._top_up(todo)
                 await self.progress(total - len(todo.due) - len(todo.live), total)
+                answered = time.monotonic()
             except (httpx.HTTPError, PrefectHTTPStatusError) as error:
-                # The server is restarting or busy; what is lost is this round alone.
+                # The server is restarting or busy: what is lost is this round alone. Gone for good, so is the feeder.
+                if time.monotonic() - answered > SERVER_GONE_S:
+                    raise
                 self.log.warning("Prefect's server did not answer (%s); trying again", type(error).__name__)
             if todo is None or todo.due or todo.live:
                 await asyncio.sleep(self.poll_s)

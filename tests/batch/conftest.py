@@ -37,7 +37,7 @@ def wait_for(condition: Callable[[], Any], what: str, limit_s: float = READY_S) 
     deadline = time.monotonic() + limit_s
     while not (value := condition()):
         assert time.monotonic() < deadline, f"waited {limit_s:.0f} s for {what}"
-        time.sleep(0.1)
+        time.sleep(0.3)
     return value
 
 
