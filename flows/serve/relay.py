@@ -16,10 +16,10 @@ def main() -> int:
     """Return the run's exit status, or die of the signal that it died of."""
     connection = socket.socket(socket.AF_UNIX)
     connection.connect(sys.argv[1])
+    order = json.dumps({"environment": dict(os.environ), "folder": os.getcwd()}).encode()  # noqa: PTH109 - no pathlib
+    connection.sendall(struct.pack("!I", len(order)) + order)
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         signal.signal(number, lambda got, frame: connection.send(bytes([got])))
-    order = json.dumps({"environment": dict(os.environ), "folder": os.getcwd()}).encode()  # noqa: PTH109 - pathlib costs time
-    connection.sendall(struct.pack("!I", len(order)) + order)
     answer = connection.recv(4)
     if len(answer) < 4:
         print("the nursery of this worker is gone, and its runs with it; restart the worker", file=sys.stderr)
