@@ -174,6 +174,7 @@ def _slots(name: str) -> int:
 
 
 def test_more_runs_than_a_page_are_listed(server: Server, tmp_path: Path) -> None:
+    server.stop_workers()  # these runs are there to be listed
     number = PAGE + 5
 
     async def create() -> tuple[int, int]:
