@@ -13,7 +13,8 @@ _SECRET_NAME = re.compile(
     r"|token|apikey|accesskey|policy)(?:$|[_\-.])|token$|^x-amz-|^x-goog-|signature|secret|password",
     re.IGNORECASE,
 )
-_USERINFO = re.compile(r"(?<=://)[^/?#\s'\"<>]*@")
+# In abfs://CONTAINER@ACCOUNT/KEY the part before the @ is no secret.
+_USERINFO = re.compile(r"(?<!abfs://)(?<!abfss://)(?<=://)[^/?#\s'\"<>]*@")
 _PARAMETER = re.compile(r"(?<=[?&;#])([^=?&;#\s'\"<>]+)=([^&;#\s'\"<>]*)")
 # The scheme's length is bounded so that a long line costs linear time.
 _ADDRESS = re.compile(r"[a-z][a-z0-9+.\-]{0,19}://[^\s'\"<>]*", re.IGNORECASE)
