@@ -32,7 +32,7 @@ class Handler(BaseHTTPRequestHandler):
         else:
             answer(self)
 
-    do_GET = do_HEAD = do_POST = _serve
+    do_GET = do_HEAD = do_POST = _serve  # noqa: N815 - the names that http.server calls
 
     def reply(self, status: int, body: bytes = b"", **headers: str) -> None:
         self.send_response(status)
