@@ -39,7 +39,8 @@ def has_secret(url: str) -> bool:
 def shown(text: str) -> str:
     """Somebody's text, fit for a message or a log line: redacted, one line, printable, not too long."""
     # Redact before cutting: half a secret is one, too.
-    line = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in redact(text))
+    safe = redact(text)
+    line = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in safe[: _MAX_SHOWN + 1])
     return line if len(line) <= _MAX_SHOWN else f"{line[:_MAX_SHOWN]}... ({len(text)} characters)"
 
 

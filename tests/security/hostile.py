@@ -42,7 +42,7 @@ def that_ask(url: str) -> list[Hostile]:
     loose = {**_OPEN, "allowed_extensions": "ALL", "extension_picky": "0"}
     master = f"#EXTM3U\n#EXT-X-STREAM-INF:BANDWIDTH=1\n{url}\n"
     dash = (
-        '<?xml version="1.0"?><MPD xmlns="urn:mpeg:dash:schema:mpd:2011" type="static" mediaPresentationDuration="PT1S">'
+        '<?xml version="1.0"?><MPD xmlns="urn:mpeg:dash:schema:mpd:2011" type="static">'
         f"<Period><AdaptationSet mimeType='video/mp4'><Representation id='1' bandwidth='1'><BaseURL>{url}</BaseURL>"
         "<SegmentList><SegmentURL media=''/></SegmentList></Representation></AdaptationSet></Period></MPD>"
     )
@@ -104,7 +104,7 @@ def _mov_with_data_elsewhere(folder: Path) -> bytes:
 
 
 def _replaced(data: bytes, path: list[bytes], box: bytes) -> bytes:
-    """`data` with the first box at `path` replaced and the sizes around it set right; what follows `moov` moves along."""
+    """`data` with the first box at `path` replaced and the sizes around it set right."""
     out, place = b"", 0
     while place < len(data):
         size, kind = struct.unpack_from(">I4s", data, place)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 
 import av
@@ -56,10 +57,9 @@ def test_the_same_files_do_ask_when_nothing_guards_ffmpeg(
     """The counterpart that shows the traps to be real: without it zero requests would prove nothing."""
     sample = hostile(server, clip, name)
     assert sample.unguarded is not None
-    try:
+    # What is served need not be what the format wants; that it was asked for is what counts.
+    with contextlib.suppress(av.error.FFmpegError):
         read_all(written(sample, tmp_path), sample.kind, sample.unguarded)
-    except av.error.FFmpegError:
-        pass  # what is served need not be what the format wants; that it was asked for is what counts
     assert server.asked("/secret.ts") >= 1
 
 
