@@ -106,7 +106,7 @@ def test_a_kubernetes_job_fits_kubernetes_schema_and_runs_without_privileges() -
             assert ("PersistentVolumeClaim", volume["persistentVolumeClaim"]["claimName"]) in named
     assert {mount["name"] for mount in container["volumeMounts"]} == {volume["name"] for volume in pod["volumes"]}
     labels = manifest["spec"]["template"]["metadata"]["labels"]
-    assert labels["app.kubernetes.io/part-of"] == "ahoy-workers", "the network policy holds for jobs, too"
+    assert labels["ahoy-network"] == "workers", "the network policy holds for jobs, too"
 
 
 def test_a_kubernetes_job_gets_its_credentials_by_reference() -> None:
