@@ -29,10 +29,12 @@ class SourcePolicy(BaseModel):
         max_redirects: of one request.
         connect_timeout_s: for a connection; `read_timeout_s`: without a byte; `total_timeout_s`: for one video.
         attempts: tries after transient errors, the first one included.
+        backoff_s: wait before the second try; doubled before each later one, up to a minute.
         max_bytes_per_s: download no faster than this; None for no limit.
         max_height: of pages that offer several sizes, the largest that is at most so many lines high.
         netrc: a netrc file with user names and passwords by host.
         cookies: a Netscape cookies file for pages.
+        cache_bytes: downloads kept on this machine; the longest unused ones go first.
         archive: yt-dlp's download archive: fetched pages are noted there, and `read_list` leaves out what it names.
     """
 
@@ -51,7 +53,9 @@ class SourcePolicy(BaseModel):
     read_timeout_s: float = Field(default=30.0, gt=0)
     total_timeout_s: float = Field(default=3600.0, gt=0)
     attempts: int = Field(default=5, ge=1)
+    backoff_s: float = Field(default=1.0, ge=0)
     max_bytes_per_s: int | None = Field(default=None, ge=1)
+    cache_bytes: int = Field(default=100 * 2**30, ge=0)
     max_height: int = Field(default=1080, ge=144)
     netrc: Path | None = None
     cookies: Path | None = None

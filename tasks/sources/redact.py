@@ -13,7 +13,8 @@ _SECRET_NAME = re.compile(
     r"|token|apikey|accesskey|policy)(?:$|[_\-.])|token$|^x-amz-|^x-goog-|signature|secret|password",
     re.IGNORECASE,
 )
-_USERINFO = re.compile(r"(?<=://)[^/?#\s'\"<>]*@")
+# In abfs://CONTAINER@ACCOUNT/KEY the part before the @ is no secret.
+_USERINFO = re.compile(r"(?<!abfs://)(?<!abfss://)(?<=://)[^/?#\s'\"<>]*@")
 _PARAMETER = re.compile(r"(?<=[?&;#])([^=?&;#\s'\"<>]+)=([^&;#\s'\"<>]*)")
 # The scheme's length is bounded so that a long line costs linear time.
 _ADDRESS = re.compile(r"[a-z][a-z0-9+.\-]{0,19}://[^\s'\"<>]*", re.IGNORECASE)
@@ -38,7 +39,8 @@ def has_secret(url: str) -> bool:
 def shown(text: str) -> str:
     """Somebody's text, fit for a message or a log line: redacted, one line, printable, not too long."""
     # Redact before cutting: half a secret is one, too.
-    line = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in redact(text))
+    safe = redact(text)
+    line = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in safe[: _MAX_SHOWN + 1])
     return line if len(line) <= _MAX_SHOWN else f"{line[:_MAX_SHOWN]}... ({len(text)} characters)"
 
 

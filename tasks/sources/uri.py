@@ -131,7 +131,7 @@ def _check_text(text: str, policy: SourcePolicy) -> None:
             f"expected a path or an address, got {shown(text)!r}, which looks like an option: "
             f"a file of that name is written ./{shown(text)}"
         )
-    if "::" in text.partition("://")[0]:
+    if "::" in text and "://" in text and not text.lower().startswith(("http://", "https://")):  # there IPv6 has them
         raise RefusedSourceError(
             f"expected one protocol, got the chain {shown(text)!r}: give the address of the file itself"
         )
@@ -215,10 +215,11 @@ def check_web(text: str, policy: SourcePolicy) -> httpx.URL:
         host = url.raw_host.decode("ascii")
     except (httpx.InvalidURL, UnicodeError, ValueError) as error:
         raise RefusedSourceError(f"expected an http(s) address, got {shown(text)!r} ({error}): correct it") from None
-    if url.scheme not in ("http", "https") or not host:
+    if url.scheme not in ("http", "https") or not host.strip("[]. ") or not 0 < (url.port or 443) < 65536:
         raise RefusedSourceError(f"expected an http(s) address with a host, got {shown(text)!r}: correct it")
-    literal = address_of_literal(host)
-    if literal is None and (host == "localhost" or host.endswith(".localhost")):
+    name = host.rstrip(".")
+    literal = address_of_literal(name)
+    if literal is None and _on(name.lower(), ("localhost",)):
         literal = ipaddress.ip_address("127.0.0.1")
     why = refusal(literal) if literal is not None else None
     if why and not policy.may_be_private(host):
