@@ -12,15 +12,17 @@ from pydantic import ValidationError
 from rich.console import Console
 from rich.markup import escape
 
-from flows import batch_cli, models_cli, server_cli
+from flows import batch_cli, models_cli, plan_cli, server_cli, store_cli
+from storage_schema.secrets import RedactSecrets
 
 if TYPE_CHECKING:
     from flows.request import VideoRequest
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 app.add_typer(models_cli.app, name="models")
+app.add_typer(store_cli.app, name="store")
 COMMANDS = (
-    *(batch_cli.submit, batch_cli.status, batch_cli.rerun, batch_cli.cancel, batch_cli.logs),
+    *(batch_cli.submit, batch_cli.status, batch_cli.rerun, batch_cli.cancel, batch_cli.logs, plan_cli.plan),
     *(server_cli.server, server_cli.worker, server_cli.install),
 )
 for command in COMMANDS:
@@ -36,6 +38,8 @@ def main(verbose: Annotated[bool, typer.Option("--verbose", "-v", help="log what
     logging.basicConfig(
         level=logging.INFO if verbose else logging.WARNING, format="%(levelname)s %(name)s: %(message)s"
     )
+    for handler in logging.getLogger().handlers:
+        handler.addFilter(RedactSecrets())
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # spinning threads made a training step six times slower
     os.environ.setdefault("PREFECT_SERVER_ANALYTICS_ENABLED", "false")
     os.environ.setdefault("DO_NOT_TRACK", "1")
