@@ -28,7 +28,6 @@ from storage_schema.status import BatchStatus, batch_status
 from storage_schema.store import ArtifactStore
 from storage_schema.tables import Tables
 
-TABLES = ("attempts", "stages", "frames", "metrics")
 SERVER_GONE_S = 900.0
 _AT_MOST = 50  # runs created between two looks at those under way
 _Logger = logging.Logger | logging.LoggerAdapter[Any]
@@ -114,8 +113,6 @@ class Feeder:
                 self.log.warning("Prefect's server did not answer (%s); trying again", type(error).__name__)
             if todo is None or todo.due or todo.live:
                 await asyncio.sleep(self.poll_s)
-        for table in TABLES:
-            self._tables.compact(table, self.queue.batch)
         return self.ended
 
     async def _watch(self, todo: Plan) -> None:
