@@ -129,30 +129,33 @@ class Feeder:
 
     async def _end(self, todo: Plan, run: FlowRun) -> None:
         work, state = todo.live[str(run.id)], run_state(run)
-        if state == "crashed" and not self._is_done(work):
+        if state == "crashed" and not self._said(work, "done"):
             next_try = todo.after_crash(work)
-            self._append([await self._crash(work, run), *([_announced(next_try)] if next_try else [])])
+            self._append([await self._epitaph(work, run), *([_announced(next_try)] if next_try else [])])
             todo.due += [next_try] if next_try else []
+        elif state == "failed" and not self._said(work, "done", "failed"):
+            self._append([await self._epitaph(work, run)])  # it failed before it could open the store
         elif state == "cancelled":
             self._append([attempt_row(work.video_id, work.attempt, CRASHED_SEQUENCE, "cancelled")])
         self.ended[state] += 1
         del todo.live[str(run.id)]
 
-    def _is_done(self, work: Work) -> bool:
-        """Whether a run got its video done and died after it had said so."""
-        mine = [("video_id", "==", work.video_id), ("attempt_number", "==", work.attempt), ("state", "==", "done")]
+    def _said(self, work: Work, *states: str) -> bool:
+        """Whether a run wrote itself that it ended so, before Prefect heard of its end."""
+        mine = [("video_id", "==", work.video_id), ("attempt_number", "==", work.attempt), ("state", "in", states)]
         return self._tables.read("attempts", self.queue.batch, filters=mine).num_rows > 0
 
-    async def _crash(self, work: Work, run: FlowRun) -> dict[str, Any]:
-        """The row that the dead run could not write."""
+    async def _epitaph(self, work: Work, run: FlowRun) -> dict[str, Any]:
+        """The row that the run could not write."""
+        state = run_state(run)
         message = run.state.message if run.state and run.state.message else "the process ended without a word"
         stage = await self.queue.stage_of(run)
-        self.log.warning("%s #%d crashed at %s: %s", work.video_id, work.attempt, stage, message)
+        self.log.warning("%s #%d %s at %s: %s", work.video_id, work.attempt, state, stage, message)
         sequence = max(run.run_count, 1) * SEQUENCE_STEP - 1
-        return attempt_row(work.video_id, work.attempt, sequence, "crashed") | {
+        return attempt_row(work.video_id, work.attempt, sequence, state) | {
             "stage": stage,
             "flow_run_id": str(run.id),
-            "error_class": "Crashed",
+            "error_class": state.capitalize(),
             "error_message": message,
         }
 
