@@ -1,4 +1,4 @@
-"""Rows of the table `attempts`: each try at a video says when it starts and how it ends, so that the store knows."""
+"""Rows of the table `attempts`: each try at a video says where it is and how it ends, so that the store knows."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ class AttemptRows:
     _started: float = field(default_factory=time.monotonic)
     _cpu: float = field(default_factory=time.process_time)
 
-    def started(self) -> None:
-        """Say that the try is at work."""
-        self._append("running")
+    def at(self, stage: str) -> None:
+        """Say that the try is at work on a stage: who dies without a word dies there."""
+        self._append("running", stage=stage)
 
     def ended(self, state: str, stage: str | None = None, error: BaseException | None = None) -> None:
         """Say how it ended.

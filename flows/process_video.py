@@ -47,15 +47,17 @@ class Caller:
 
     Attributes:
         timeout_s: seconds that one stage may take.
+        rows: told of each stage that begins.
         stage: the one at work, or the last one.
     """
 
     timeout_s: float
+    rows: AttemptRows | None = field(default=None, init=False)
     stage: str = field(default="source", init=False)
 
     def __call__(self, stage: Stage, settings: Settings, inputs: Mapping[str, StageRef | Source], run: Run) -> StageRef:
         """Run a stage as a Prefect task named after it."""
-        self.stage = stage.name
+        self._enter(stage.name)
         if is_cancelled(run.store, run.batch):
             raise BatchCancelledError(f"batch {run.batch} was cancelled before {stage.name}")
 
@@ -66,6 +68,7 @@ class Caller:
 
     def source(self, request: VideoRequest) -> Source:
         """Bring the video here; a task, so that waiting for it and trying again are seen."""
+        self._enter("source")
 
         def body() -> Source:
             with take_slots(("download",) if _is_remote(request) else ()):
@@ -73,6 +76,11 @@ class Caller:
 
         source: Source = self._as_task("source", request.video_id or source_name(request.video))(body)()
         return source
+
+    def _enter(self, stage: str) -> None:
+        self.stage = stage
+        if self.rows is not None:
+            self.rows.at(stage)
 
     def _as_task(self, name: str, video: str) -> Any:
         return task(
@@ -113,8 +121,7 @@ def run_video(
         sequence=itertools.count(first),
         take_slots=take_slots,
     )
-    rows = AttemptRows(run, flow_run.id)
-    rows.started()
+    call.rows = rows = AttemptRows(run, flow_run.id)
     try:
         source = source or call.source(request)
         outcome = process(source, request.settings(), run, only=request.stages, call=call, stages=stages)

@@ -131,10 +131,10 @@ class Feeder:
         work, state = todo.live[str(run.id)], run_state(run)
         if state == "crashed" and not self._said(work, "done"):
             next_try = todo.after_crash(work)
-            self._append([await self._epitaph(work, run), *([_announced(next_try)] if next_try else [])])
+            self._append([self._epitaph(work, run), *([_announced(next_try)] if next_try else [])])
             todo.due += [next_try] if next_try else []
         elif state == "failed" and not self._said(work, "done", "failed"):
-            self._append([await self._epitaph(work, run)])  # it failed before it could open the store
+            self._append([self._epitaph(work, run)])  # it failed before it could open the store
         elif state == "cancelled":
             self._append([attempt_row(work.video_id, work.attempt, CRASHED_SEQUENCE, "cancelled")])
         self.ended[state] += 1
@@ -145,15 +145,13 @@ class Feeder:
         mine = [("video_id", "==", work.video_id), ("attempt_number", "==", work.attempt), ("state", "in", states)]
         return self._tables.read("attempts", self.queue.batch, filters=mine).num_rows > 0
 
-    async def _epitaph(self, work: Work, run: FlowRun) -> dict[str, Any]:
-        """The row that the run could not write."""
+    def _epitaph(self, work: Work, run: FlowRun) -> dict[str, Any]:
+        """The row that the run could not write; at which stage it was is in its last one."""
         state = run_state(run)
         message = run.state.message if run.state and run.state.message else "the process ended without a word"
-        stage = await self.queue.stage_of(run)
-        self.log.warning("%s #%d %s at %s: %s", work.video_id, work.attempt, state, stage, message)
+        self.log.warning("%s #%d %s: %s", work.video_id, work.attempt, state, message)
         sequence = max(run.run_count, 1) * SEQUENCE_STEP - 1
         return attempt_row(work.video_id, work.attempt, sequence, state) | {
-            "stage": stage,
             "flow_run_id": str(run.id),
             "error_class": state.capitalize(),
             "error_message": message,

@@ -18,12 +18,9 @@ from prefect.client.schemas.filters import (
     FlowRunFilterState,
     FlowRunFilterStateType,
     FlowRunFilterTags,
-    TaskRunFilter,
-    TaskRunFilterState,
-    TaskRunFilterStateType,
 )
 from prefect.client.schemas.objects import TERMINAL_STATES, FlowRun, StateType
-from prefect.client.schemas.sorting import FlowRunSort, TaskRunSort
+from prefect.client.schemas.sorting import FlowRunSort
 from prefect.states import Cancelling, Crashed
 
 from flows.batch.plan import RunState, SeenRun, Work
@@ -180,18 +177,6 @@ class Queue:
                 await self.client.set_flow_run_state(run.id, Cancelling(message="the batch was cancelled"))
 
         await asyncio.gather(*map(one, runs))
-
-    async def stage_of(self, run: FlowRun) -> str | None:
-        """The stage that a dead run was at."""
-        tasks = await self.client.read_task_runs(
-            flow_run_filter=FlowRunFilter(id=FlowRunFilterId(any_=[run.id])),
-            task_run_filter=TaskRunFilter(
-                state=TaskRunFilterState(type=TaskRunFilterStateType(any_=[StateType.RUNNING, StateType.CRASHED]))
-            ),
-            sort=TaskRunSort.EXPECTED_START_TIME_DESC,
-            limit=1,
-        )
-        return tasks[0].name.split()[0] if tasks else None
 
     def _filter(self, live: bool) -> FlowRunFilter:
         state = FlowRunFilterState(type=FlowRunFilterStateType(any_=_LIVE)) if live else None
