@@ -16,7 +16,7 @@ from tests.sources.server import Served
 __all__ = ["clip", "server"]
 
 
-def test_ahoy_run_takes_an_address(server: Served, clip: bytes, tmp_path: Path) -> None:  # noqa: F811 - fixtures
+def test_ahoy_run_takes_an_address(server: Served, clip: bytes, tmp_path: Path) -> None:
     url = server.file("/My walk.mp4".replace(" ", "%20"), clip, ETag='"one"')
     command = [sys.executable, "-m", "flows", "run", url, "--out", str(tmp_path / "out"), "--stages", "ingest"]
     environment = {**os.environ, "AHOY_SOURCE_CACHE": str(tmp_path / "cache")}
@@ -31,7 +31,7 @@ def test_ahoy_run_takes_an_address(server: Served, clip: bytes, tmp_path: Path) 
 def test_the_policy_of_the_environment_is_asked(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    clip: bytes,  # noqa: F811
+    clip: bytes,
 ) -> None:
     (tmp_path / "clip.mp4").write_bytes(clip)
     request = VideoRequest(video=str(tmp_path / "clip.mp4"), out=str(tmp_path))
