@@ -13,7 +13,7 @@ from pathlib import Path
 from flows.serve.errors import NoServerError, ServerError
 from flows.serve.place import AUTH, QUIET, URL, check_answers
 
-READY_S = 120.0
+READY_S = 600.0  # it is at work as long as it lives; a busy machine is no error
 STOP_S = 20.0
 
 

@@ -19,6 +19,7 @@ from flows.serve.postgres import Postgres
 from flows.serve.prefect_server import PrefectServer, check_port, stop
 
 CHECK_S = 1.0
+RESTART_S = 5.0  # a server that dies at once is not started again more often than this
 
 
 @dataclass
@@ -75,12 +76,13 @@ class Supervisor:
             server.wait_ready(process)
             self.place.write_address(Address(server.url, os.getpid(), self.auth))
             ready(server)
-            while not self._stop.wait(CHECK_S):
+            pause = CHECK_S
+            while not self._stop.wait(pause):
+                pause = CHECK_S
                 if postgres and not _alive(postgres.pid()):
                     postgres.start()
                 if process.poll() is not None:
-                    process = self._start(server)
-                    server.wait_ready(process)
+                    process, pause = self._start(server), RESTART_S
         finally:
             stop(process)
             (self.place.folder / "prefect.pid").unlink(missing_ok=True)
