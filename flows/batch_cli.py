@@ -80,13 +80,14 @@ def status(
     watch: Annotated[bool, typer.Option("--watch", help=f"again every {WATCH_S:.0f} s until all have ended")] = False,
 ) -> None:
     """Show how a batch stands, by the store alone: per stage and state, errors, time left, cost."""
+    # Nothing else: importing the stages themselves would take ten seconds.
+    from storage_schema.artifacts import ARTIFACTS
     from storage_schema.status import batch_status
     from storage_schema.tables import Tables
-    from tasks.stages import STAGES
 
     with _errors():
         opened = _open(store)
-        tables, names = Tables(opened), [stage.name for stage in STAGES]
+        tables, names = Tables(opened), list(ARTIFACTS)
         now = batch_status(opened, tables, batch, names)
         if as_json:
             sys.stdout.write(json.dumps(now.to_json(records=True), indent=1) + "\n")

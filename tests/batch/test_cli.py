@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -11,6 +13,8 @@ from flows.cli import app
 from storage_schema.batches import cancel_batch, list_batches, read_batch
 from storage_schema.store import ArtifactStore
 from tests.batch.toy import Toy
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(autouse=True)
@@ -90,3 +94,16 @@ def test_an_unknown_batch_is_refused(command: str, tmp_path: Path) -> None:
 def test_a_worker_without_a_server_says_how_to_start_one() -> None:
     result = _ahoy("worker")
     assert result.exit_code == 4 and "ahoy server" in result.output
+
+
+def test_status_imports_neither_the_science_nor_the_orchestrator(videos: Path, tmp_path: Path) -> None:
+    """They take ten seconds, and status is asked for often."""
+    _ahoy("submit", videos, "--store", tmp_path / "store", "--batch", "b")
+    code = (
+        "import sys; from typer.testing import CliRunner; from flows.cli import app;"
+        "done = CliRunner().invoke(app, ['status', 'b', '--store', sys.argv[1]]);"
+        "print(done.exit_code, [name for name in ('torch', 'prefect', 'numba') if name in sys.modules])"
+    )
+    command = [sys.executable, "-c", code, str(tmp_path / "store")]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.stdout.strip() == "0 []", done.stdout + done.stderr
