@@ -37,7 +37,7 @@ def main(verbose: Annotated[bool, typer.Option("--verbose", "-v", help="log what
 
 @app.command()
 def run(
-    video: Annotated[str, typer.Argument(help="a video file")],
+    video: Annotated[str, typer.Argument(help="a video: a path or an address")],
     out: Annotated[Path, typer.Option(help="folder for the avatar, the videos and the report")],
     preset: Annotated[str, typer.Option(help="draft, standard or high: how much time to spend")] = "standard",
     subject: Annotated[int | None, typer.Option(help="which person, 0 for the most visible")] = None,

@@ -6,7 +6,6 @@ The store, not Prefect, knows what is done: tasks keep no results and no cache, 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 from prefect import flow, task
@@ -18,6 +17,7 @@ from flows.pipeline import process
 from flows.prefect_observer import PrefectObserver
 from flows.request import VideoRequest
 from tasks.settings import Settings
+from tasks.sources import source_name
 from tasks.stage import Run, Source, Stage, StageRef, run_stage
 
 
@@ -34,9 +34,9 @@ def call_as_task(stage: Stage, settings: Settings, inputs: Mapping[str, StageRef
 
 
 def _run_name() -> str:
-    """The video's file name: what a person looks for in a list of runs."""
+    """The video's short name, without anything secret or misleading: what a person looks for in a list of runs."""
     request: Any = flow_run.parameters["request"]
-    return Path(request["video"] if isinstance(request, dict) else request.video).name
+    return source_name(request["video"] if isinstance(request, dict) else request.video)
 
 
 @flow(name="process-video", flow_run_name=_run_name, persist_result=False, log_prints=False)

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import os
 import uuid
 from pathlib import Path
 
+import platformdirs
 from pydantic import BaseModel, ConfigDict, Field
 
-from storage_schema.keys import file_sha256
 from storage_schema.store import ArtifactStore
 from storage_schema.tables import Tables
 from tasks.presets import PRESETS
 from tasks.settings import Preset, Settings
+from tasks.sources import fetch_source, policy_from_environment
 from tasks.stage import Observer, Run, Source
 
 
@@ -20,35 +22,41 @@ class VideoRequest(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    video: str = Field(description="path of a video file")
+    video: str = Field(description="path or address of a video (http, https, YouTube, s3, ...)")
     out: str = Field(description="folder for the avatar, the videos and the report")
     store: str | None = Field(None, description="URL of the artifact store; by default OUT/store")
     preset: Preset = Field("standard", description="how much time to spend")
     subject: int | None = Field(None, ge=0, description="which person, counted from the most visible; by default 0")
+    start_s: float | None = Field(None, ge=0, description="first moment used, in seconds; by default the beginning")
+    end_s: float | None = Field(None, gt=0, description="moment at which using stops; by default the end")
     stages: tuple[str, ...] | None = Field(None, description="only these stages and what they need; by default all")
     overrides: tuple[str, ...] = Field((), description="knobs, as STAGE.KNOB=VALUE")
     batch: str = Field("local", pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", description="name the rows are filed under")
 
     def settings(self) -> Settings:
-        """Return the preset with the subject and the overrides applied."""
-        chosen = PRESETS[self.preset]
-        if self.subject is not None:
-            chosen = chosen.with_overrides([f"perceive.subject={self.subject}"])
-        return chosen.with_overrides(self.overrides)
+        """Return the preset with the subject, the time span and the overrides applied."""
+        named = {"perceive.subject": self.subject, "ingest.start_s": self.start_s, "ingest.end_s": self.end_s}
+        said = [f"{knob}={value!r}" for knob, value in named.items() if value is not None]
+        return PRESETS[self.preset].with_overrides((*said, *self.overrides))
 
     def source(self) -> Source:
-        """Return the video by content.
+        """Bring the video to this machine and return it by content.
 
         Raises:
-            FileNotFoundError: there is no such file.
+            BadInputError: it is refused, not there, or no single video.
+            TransientError: it could not be fetched, for a reason that may pass.
         """
-        path = Path(self.video).expanduser()
-        if not path.is_file():
-            raise FileNotFoundError(f"expected a video file, got {self.video!r}, which is not there; check the path")
-        return Source(path, file_sha256(path))
+        video = str(Path(self.video).expanduser()) if self.video.startswith("~") else self.video
+        return fetch_source(video, policy_from_environment(), source_cache())
 
     def run(self, source: Source, observer: Observer) -> Run:
         """Open the store and name this attempt."""
         store = ArtifactStore(self.store or Path(self.out) / "store")
-        video_id = f"{Path(self.video).stem[:40]}-{source.content_hash[:8]}"
+        video_id = f"{source.name}-{source.content_hash[:8]}"
         return Run(store, Tables(store), self.batch, video_id, uuid.uuid4().hex[:12], observer)
+
+
+def source_cache() -> Path:
+    """Where fetched videos are kept: `AHOY_SOURCE_CACHE`, or a folder of the user's cache."""
+    chosen = os.environ.get("AHOY_SOURCE_CACHE")
+    return Path(chosen) if chosen else Path(platformdirs.user_cache_dir("ahoy", appauthor=False)) / "sources"

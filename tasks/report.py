@@ -59,12 +59,16 @@ class ReportConfig(BaseModel):
 
 def run_report(config: ReportConfig, ctx: StageContext) -> StageOutput:
     """Write `report.html`."""
-    page = Environment(
-        loader=PackageLoader("tasks"), autoescape=select_autoescape(default=True, default_for_string=True)
-    )
-    text = page.get_template("report.html.j2").render(**_content(ctx))
+    text = page_environment().get_template("report.html.j2").render(**_content(ctx))
     (ctx.out / "report.html").write_text(text, encoding="utf-8")
     return StageOutput()
+
+
+def page_environment() -> Environment:
+    """The templates, with everything that goes into them escaped: names and messages come from strangers' videos."""
+    return Environment(
+        loader=PackageLoader("tasks"), autoescape=select_autoescape(default=True, default_for_string=True)
+    )
 
 
 def _content(ctx: StageContext) -> dict[str, Any]:

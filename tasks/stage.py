@@ -127,10 +127,17 @@ class StageRef:
 
 @dataclass(frozen=True)
 class Source:
-    """The video file itself, as an input: known by its content, wherever it lies."""
+    """The video file itself, as an input: known by its content, wherever it lies.
+
+    Attributes:
+        name: short and harmless, for folders and tables.
+        origin: where it came from, for people; without credentials.
+    """
 
     path: Path
     content_hash: str
+    name: str = "video"
+    origin: str = ""
 
 
 @dataclass(frozen=True)

@@ -24,22 +24,13 @@ from ahoy_core.formats.errors import (
     StillImageError,
     UnsupportedCodecError,
 )
+from ahoy_core.formats.sniff import HEAD_BYTES, names_other_files, still_kind
 
 # Containers that hold their own data. Playlists, concat scripts, image sequences and devices are not among them: they
 # name other files or addresses, and a list of videos may come from strangers.
 DEMUXERS = ("mov", "mp4", "matroska", "webm", "avi", "mpegts", "mpeg", "flv", "asf", "ogg", "mxf", "ivf", "gif")
 MAX_PIXELS = 2**27  # four times 8K; beyond that a forged header could exhaust the memory
 _MAX_THREADS = 4  # each decoding thread holds a full-size picture
-
-_STILLS = {
-    b"\x89PNG": "PNG",
-    b"\xff\xd8\xff": "JPEG",
-    b"BM": "BMP",
-    b"II*\x00": "TIFF",
-    b"MM\x00*": "TIFF",
-    b"8BPS": "PSD",
-}
-_REFERRERS = (b"#EXTM3U", b"ffconcat", b"<?xml", b"<MPD", b"[playlist]", b"<smil")
 
 
 def open_video(path: str | Path) -> InputContainer:
@@ -113,13 +104,11 @@ def _check_file(source: Path) -> None:
 
 def _why_not_opened(source: Path, error: Exception) -> Exception:
     with source.open("rb") as handle:
-        head = handle.read(64)
-    for magic, name in _STILLS.items():
-        if head.startswith(magic):
-            return StillImageError(
-                f"expected a video, got {source.name!r}, which is a {name} picture: give a video file"
-            )
-    if head.lstrip(b"\xef\xbb\xbf \r\n\t").startswith(_REFERRERS):
+        head = handle.read(HEAD_BYTES)
+    still = still_kind(head)
+    if still:
+        return StillImageError(f"expected a video, got {source.name!r}, which is a {still} picture: give a video file")
+    if names_other_files(head):
         return RefusedContainerError(
             f"expected a self-contained video, got {source.name!r}, which is a list that names other files: "
             "give the video files themselves"

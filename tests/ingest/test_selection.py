@@ -52,6 +52,21 @@ def test_selected_frames_are_the_same_pictures_as_without_selection(tmp_path: Pa
     assert any("thinned evenly to 10" in note for note in part.notes)
 
 
+@pytest.mark.parametrize("container", ["mp4", "mkv", "ts"])
+def test_a_time_span_is_kept_exactly_by_the_frames_own_times(tmp_path: Path, container: str) -> None:
+    """Uneven times, spans that begin and end on a frame: the first is in, the last is out, by exact comparison."""
+    times = [0, 40, 90, 100, 270, 300, 333, 400, 480, 555]
+    whole = ingest(encode(tmp_path / f"clip.{container}", moving(len(times)), times=times))
+    pts = whole.pts.tolist()
+    assert len(pts) == len(times) and np.allclose(pts, np.array(times) / 1000, atol=2e-3)
+    for first, last in ((0, 10), (1, 4), (4, 5), (3, 9), (9, 10)):
+        end = pts[last] if last < len(pts) else None
+        part = ingest(tmp_path / f"clip.{container}", IngestConfig(start_s=pts[first], end_s=end))
+        assert part.index.tolist() == list(range(first, last))
+        assert part.pts.tolist() == pts[first:last]
+        assert np.array_equal(part.frames, whole.frames[first:last])
+
+
 def test_empty_range_says_how_long_the_video_is(tmp_path: Path) -> None:
     path = encode(tmp_path / "clip.mp4", moving(25))
     with pytest.raises(EmptySelectionError, match=r"lasts 1\.00 s"):
