@@ -14,8 +14,8 @@ from ahoy_core.body.rotations import matrix_to_axis_angle
 
 ARM_ANGLE: Final = math.radians(45)  # of the arm below the horizontal
 LEG_ANGLE: Final = math.radians(7)  # of the leg from the vertical, outwards: feet about as far apart as the shoulders
-# Joint, and the joint that its bone points to, for one side: what the packaged body and the SMPL family call them. Where
-# several are named, the first that a body has is taken.
+# Joint, and the joint that its bone points to, for one side: what the packaged body and the SMPL family call them; the
+# first name that a body has is taken.
 _ARM = (
     (("upperarm01.L", "left_shoulder"), ("lowerarm01.L", "left_elbow")),
     (("lowerarm01.L", "left_elbow"), ("wrist.L", "left_wrist")),

@@ -17,7 +17,7 @@ from ahoy_core.body.lbs import forward_kinematics, global_rotations, local_rotat
 from ahoy_core.body.model import BodyModel
 from ahoy_core.body.packaged import PackagedBody
 from ahoy_core.body.rotations import axis_angle_to_matrix, matrix_to_axis_angle, nearest_rotation
-from ahoy_core.body.smpl_names import is_limb, packaged_from_smpl, smpl_from_packaged, within_smpl
+from ahoy_core.body.smpl_names import JOINT_NAMES, is_limb, packaged_from_smpl, smpl_from_packaged, within_smpl
 
 
 @dataclass(frozen=True)
@@ -149,7 +149,8 @@ def body_skeleton(body: BodyModel, betas: Tensor | None = None) -> Skeleton:
     """A body's skeleton, for a shape [S] (an average adult by default)."""
     betas = (body.default_betas if betas is None else betas)[None]
     still = betas.new_zeros(1, body.n_joints, 3)
-    return Skeleton(body.joint_names, body.parents, body(still, betas, still[:, 0]).rest_joints[0].detach(), body.name)
+    rest = body(still, betas, still[:, 0]).rest_joints[0].detach()
+    return Skeleton(body.joint_names, body.parents, rest, "T of SMPL" if _is_smpl(body.joint_names) else body.name)
 
 
 def convert_body_pose(
@@ -186,12 +187,16 @@ def convert_body_pose(
 
 def joint_map(target_names: tuple[str, ...], source_names: tuple[str, ...]) -> dict[str, str] | None:
     """Target joint -> source joint between the bodies we know; None (equal names) for two of the same family."""
-    to_smpl, from_smpl = (names[0] == "pelvis" for names in (target_names, source_names))
+    to_smpl, from_smpl = _is_smpl(target_names), _is_smpl(source_names)
     if to_smpl and from_smpl:
         return within_smpl(target_names, source_names)
     if to_smpl:
         return smpl_from_packaged(target_names)
     return packaged_from_smpl(source_names) if from_smpl else None
+
+
+def _is_smpl(joint_names: tuple[str, ...]) -> bool:
+    return joint_names[0] == JOINT_NAMES["smpl"][0]
 
 
 def rig_skeleton(body: PackagedBody) -> Skeleton:

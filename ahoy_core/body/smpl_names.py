@@ -26,8 +26,8 @@ _MIDDLE: Final = {"pelvis": "root", "spine1": "spine05", "spine2": "spine03", "s
                   "head": "head", "jaw": "jaw"}  # fmt: skip
 _SIDED: Final = {"hip": "upperleg01", "knee": "lowerleg01", "ankle": "foot", "foot": "toe3-1", "collar": "clavicle",
                  "shoulder": "upperarm01", "elbow": "lowerarm01", "wrist": "wrist", "eye_smplhf": "eye"}  # fmt: skip
-# One joint of the SMPL family that moves several of the packaged body.
-_SPREAD: Final = {"foot": tuple(f"toe{k}-1" for k in range(1, 6)), "hand": tuple(f"finger{k}-1" for k in range(2, 6))}
+# The SMPL family's one joint of the toes moves all of the packaged body's.
+_TOES: Final = tuple(f"toe{k}-1" for k in range(1, 6))
 # Rest poses differ in arms and legs alone: everybody's trunk stands upright and everybody's soles are flat, whatever
 # the slope of the bones that run through them.
 _LIMBS: Final = ("hip", "knee", "shoulder", "elbow", "wrist")
@@ -41,20 +41,18 @@ def packaged_from_smpl(smpl_names: tuple[str, ...]) -> dict[str, str]:
     """Joints of the packaged body -> joints of an SMPL-family body: the map for poses that go to the packaged body."""
     pairs = {packaged: smpl for smpl, packaged in smpl_from_packaged(smpl_names).items()}
     for letter, side in (("L", "left"), ("R", "right")):
-        for part, several in _SPREAD.items():
-            if f"{side}_{part}" in smpl_names:
-                pairs |= {f"{name}.{letter}": f"{side}_{part}" for name in several}
+        pairs |= {f"{toe}.{letter}": f"{side}_foot" for toe in _TOES}
     return pairs
 
 
 def smpl_from_packaged(smpl_names: tuple[str, ...]) -> dict[str, str]:
     """Joints of an SMPL-family body -> joints of the packaged body: the map for poses that come from it.
 
-    SMPL's single hand joint follows the middle finger.
+    SMPL's hand joint, which bends all fingers at once, has no partner and rests.
     """
     pairs = dict(_MIDDLE)
     for letter, side in (("L", "left"), ("R", "right")):
-        sided = {**_SIDED, **_finger_pairs(), "hand": "finger3-1"}
+        sided = {**_SIDED, **_finger_pairs()}
         pairs |= {f"{side}_{smpl}": f"{packaged}.{letter}" for smpl, packaged in sided.items()}
     return {smpl: packaged for smpl, packaged in pairs.items() if smpl in smpl_names}
 

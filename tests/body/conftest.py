@@ -7,7 +7,8 @@ import torch
 
 from ahoy_core.body.model import BodyModel
 from ahoy_core.body.packaged import load_packaged_body
-from ahoy_core.body.smpl import SmplBody, load_smpl
+from ahoy_core.body.smpl import SmplBody
+from ahoy_core.body.smpl_load import load_smpl
 
 from . import licensed
 

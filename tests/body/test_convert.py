@@ -222,7 +222,7 @@ def test_the_trunk_and_the_feet_rest_as_they_do_and_hands_follow_the_forearm(bod
     """The packaged body at rest (A-pose) is the SMPL-X body with its arms lowered, and nothing else turned."""
     source, target = bodies64["packaged"], bodies64["smplx"]
     zero = torch.zeros(1, source.n_joints, 3, dtype=torch.float64)
-    pose, transl = convert_body_pose(source, target, zero, zero[:, 0])
+    pose, _ = convert_body_pose(source, target, zero, zero[:, 0])
     world = global_rotations(axis_angle_to_matrix(pose), target.parents)[0]
     eye = torch.eye(3, dtype=torch.float64)
     for name in ("pelvis", "spine1", "spine3", "head", "left_ankle", "right_foot", "left_collar"):

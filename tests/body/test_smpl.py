@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from ahoy_core.body.keypoints import LANDMARK_NAMES
 from ahoy_core.body.lbs import normalize_weights
-from ahoy_core.body.smpl import SmplBody, _shape_basis, load_smpl
+from ahoy_core.body.smpl import SmplBody
+from ahoy_core.body.smpl_load import _shape_basis, load_smpl
 
 from . import licensed
 from .test_bodies import random_input
