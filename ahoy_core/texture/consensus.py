@@ -48,6 +48,12 @@ class Consensus:
         agreeing[~own] = near.any(axis=1) | (around < 0).all(axis=1)
         return agreeing
 
+    def closeness(self, texel: IntArray, rgb: IntArray) -> FloatArray:
+        """How near colours [K,3] uint8 of texels [K] are to what most frames show: 1 the same, towards 0 the further."""
+        gap = np.abs(rgb.astype(np.int16) - self.rgb[texel]).sum(axis=-1)
+        nearness: FloatArray = (1 / (1 + gap)).astype(np.float32)
+        return nearness
+
     def _close(self, a: IntArray, b: IntArray) -> BoolArray:
         close: BoolArray = np.abs(a.astype(np.int16) - b).max(axis=-1) <= self.tolerance
         return close
