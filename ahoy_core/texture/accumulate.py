@@ -27,9 +27,7 @@ VOTING_FRAMES = 16
 
 @dataclass(frozen=True)
 class Log:
-    """By frame number: texels written, the shift (x, y in pixels) found before writing, and the mean gain where a
-    frame was brought to another exposure.
-    """
+    """By frame number: texels written, the shift found (x, y in pixels), the mean gain where exposure was changed."""
 
     written: dict[int, int] = field(default_factory=dict)
     shifts: dict[int, tuple[float, float]] = field(default_factory=dict)
@@ -38,8 +36,10 @@ class Log:
 
 @dataclass(frozen=True)
 class Look:
-    """One frame about to be read: its number, how it is seen (None: its body is not finite), its picture [H,W,3] uint8
-    at the atlas's exposure, and what was changed for that.
+    """One frame about to be read.
+
+    Its number, how it is seen (None: its body is not finite), its picture [H,W,3] uint8 at the atlas's exposure, and
+    what was changed for that.
     """
 
     number: int

@@ -49,7 +49,7 @@ class Consensus:
         return agreeing
 
     def closeness(self, texel: IntArray, rgb: IntArray) -> FloatArray:
-        """How near colours [K,3] uint8 of texels [K] are to what most frames show: 1 the same, towards 0 the further."""
+        """How near colours [K,3] uint8 of texels [K] are to what most frames show: 1 the same, 0 far off."""
         gap = np.abs(rgb.astype(np.int16) - self.rgb[texel]).sum(axis=-1)
         nearness: FloatArray = (1 / (1 + gap)).astype(np.float32)
         return nearness

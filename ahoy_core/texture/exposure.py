@@ -1,7 +1,7 @@
 """Exposure drift: a camera that brightens or darkens during the clip must not leave its steps in the atlas.
 
 Each frame is brought to the exposure of what is known already (the consensus, else what was written), per channel,
-before it votes or writes. The relation is estimated on the same texels in both, so what the frame shows does not matter.
+before it votes or writes. The relation is estimated on the same texels in both, whatever the frame shows.
 """
 
 from __future__ import annotations

@@ -5,10 +5,11 @@
    (`ahoy_core.texture.parts`) are cut. The interpolation is pulled to what is likely: the back of the clothes to the
    front of the same part, the back of the head to its top, hands and face to the skin that was seen; a part of which
    nothing is known to a neutral colour (`ahoy_core.texture.tones`).
-3. A screened Poisson solve over the texels joins the pieces of a part: gradients of the mirrored colours are kept, steps
-   at their border are not.
+3. A screened Poisson solve over the texels joins the pieces of a part: gradients of the mirrored colours are kept,
+   steps at their border are not.
 
-Seen texels keep their colours bit by bit. Skin is the one exception to "each part from itself": face and hands share it.
+Seen texels keep their colours bit by bit. Skin is the one exception to "each part from itself": face and hands share
+it.
 """
 
 from __future__ import annotations
@@ -39,7 +40,8 @@ class FilledAtlas:
     """A complete atlas, and where its colours come from.
 
     rgb [A,A,3] uint8, charts padded. mirrored and diffused are shares of the body's surface area; the rest was seen.
-    part [N] uint8 of each texel, garments the borders that the colours showed. skin is the tone used for unseen hands and face, skin_from tells whether it was "seen" or "neutral".
+    part [N] uint8 of each texel, garments the borders that the colours showed. skin is the tone used for unseen hands
+    and face, skin_from tells whether it was "seen" or "neutral".
     """
 
     rgb: IntArray
