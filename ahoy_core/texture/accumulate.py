@@ -78,14 +78,19 @@ def accumulate(
     consensus = None
     if voters:
         votes, atlas = Votes(len(texels.face), len(voters)), _atlas(clip, texels, None)
+        gains = []
         for view in _looks(clip, atlas, voters):
             if view.seen is not None:
+                gains.append(np.ones(3) if view.exposure is None else view.exposure.gain)
                 texel, rgb, _, _ = atlas.read(view.image, clip.visible[view.number], view.seen)
                 votes.add(texel, rgb)
                 atlas.add(view.number, view.image, clip.visible[view.number], view.seen)
             done = _report(progress, done, total)
         # 0 levels: everything is written, and the consensus only ranks it.
         consensus = votes.consensus(points, config.outlier_levels or 255.0)
+        if gains:
+            # So far everything has the first frame's exposure; the clip's is that of its middle one.
+            consensus = consensus.scaled(1 / np.median(gains, axis=0))
     atlas, log = _atlas(clip, texels, consensus), Log()
     weights, fit = clip.body.lbs_weights.cpu().numpy(), clip.fit
     for view in _looks(clip, atlas, chosen):

@@ -6,7 +6,7 @@ and a fit that is off for a moment paints an arm onto the chest; both contradict
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -37,6 +37,10 @@ class Consensus:
     votes: IntArray
     tolerance: float
     palette: IntArray
+
+    def scaled(self, gain: FloatArray) -> Consensus:
+        """The same at another exposure: colours times gain [3]."""
+        return replace(self, rgb=np.clip(np.rint(self.rgb * gain), 0, 255).astype(np.uint8))
 
     def agrees(self, texel: IntArray, rgb: IntArray) -> BoolArray:
         """Whether colours [K,3] uint8 of texels [K] agree with what most frames show, or nothing can tell. [K] bool."""

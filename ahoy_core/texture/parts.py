@@ -63,7 +63,7 @@ def find_parts(surface: Surface, vertices: FloatArray, colours: FloatArray, seen
         if waist is not None:
             part[body] = np.where(height[body] < waist, LEG_PART, TRUNK_PART)
             found.append("waist")
-        elif _both_seen(height[band & seen], top):
+        elif min((band & seen & legs).sum(), (band & seen & ~legs).sum()) >= LEAST_SIDE:
             part[body] = TRUNK_PART
     arms = dressed & (surface.limb == ARM)
     along = _along_arms(vertices)
@@ -87,11 +87,6 @@ def _along_arms(vertices: FloatArray) -> FloatArray:
     middle = (vertices[:, 0].min() + vertices[:, 0].max()) / 2
     outward: FloatArray = (np.abs(vertices[:, 0] - middle) - vertices[:, 2]) / np.sqrt(2)
     return outward
-
-
-def _both_seen(along: FloatArray, border: float) -> bool:
-    below = int((along < border).sum())
-    return below >= LEAST_SIDE and len(along) - below >= LEAST_SIDE
 
 
 def best_cut(along: FloatArray, colours: FloatArray) -> float | None:
