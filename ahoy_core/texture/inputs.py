@@ -33,7 +33,7 @@ class TextureConfig(BaseModel):
     atlas_size: int = Field(512, ge=16, le=4096)
     frame_stride: int = Field(1, ge=1)
     rule: WriteRule = "median"
-    exposure: ExposureMatch = "gain"
+    exposure: ExposureMatch = "off"
     grazing_cos: float = Field(0.3, gt=0, lt=1)
     boundary_px: float = Field(2.0, ge=0)
     min_frame_confidence: float = Field(0.3, ge=0, le=1)
