@@ -71,9 +71,9 @@ def _roles(config: TextureConfig) -> Mapping[str, Role]:
     return {
         "body": packaged_body(),
         "surface": ours("ray-cast of the fitted body"),
-        "inpaint": ours("symmetry and diffusion over the body's surface"),
+        "inpaint": ours("symmetry and harmonic filling over the body's surface, part by part"),
         "views": ours("renders of the textured body"),
     }
 
 
-TEXTURE = Stage("texture", 1, TextureConfig, ("ingest", "perceive"), run_texture, _roles)
+TEXTURE = Stage("texture", 2, TextureConfig, ("ingest", "perceive"), run_texture, _roles)
