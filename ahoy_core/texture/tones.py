@@ -12,6 +12,7 @@ from ahoy_core.texture.texels import TexelMap
 
 NEUTRAL_SKIN = (198.0, 160.0, 138.0)
 NEUTRAL_CLOTH = (128.0, 128.0, 128.0)
+NEUTRAL_SHOE = (66.0, 62.0, 60.0)
 # Strength of a guess against a link between neighbours: it takes over about 1 / sqrt(pull) vertices, some 4 cm, from
 # the last colour that was seen. Weaker, and skin washes out over the shoulders and jeans over the shirt's back.
 LIKELY_PULL = 0.5
@@ -96,6 +97,7 @@ def likely_colours(
     """
     target = np.tile(np.array(NEUTRAL_CLOTH), (len(vertices), 1))
     strength = np.zeros(len(vertices))
+    target[surface.feet] = NEUTRAL_SHOE
     for number in np.unique(part[~surface.hands & ~surface.head]):
         own = (part == number) & ~surface.hands & ~surface.head
         if (known & own).any():
