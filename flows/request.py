@@ -53,7 +53,7 @@ class VideoRequest(BaseModel):
         """Open the store and name this attempt."""
         store = ArtifactStore(self.store or Path(self.out) / "store")
         video_id = f"{source.name}-{source.content_hash[:8]}"
-        return Run(store, Tables(store), self.batch, video_id, uuid.uuid4().hex[:12], observer)
+        return Run(store, Tables(store), self.batch, video_id, uuid.uuid4().hex[:12], observer, self.settings().body)
 
 
 def source_cache() -> Path:
