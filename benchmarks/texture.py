@@ -1,11 +1,13 @@
 """The texture of captures whose truth is known: `python -m benchmarks.texture CAPTURES_DIR --json OUT`.
 
 Pose, camera and visible mask are the true ones; `--shift-m` moves the body by that much noise in every frame, as a bad
-fit would. One JSON line per capture, mode (first or best view of a texel wins) and alignment (on or off), after one
-that names the machine. Shares are of the surface. `colour_error` is the mean absolute difference, of 255, between
-texels that were seen and the true front view; `psnr_seen` and `psnr_filled` are over all four cameras, by whether the
-texel was seen. `seconds_per_frame` and `cpu_seconds_per_frame` are those of the loop over frames (a frame that votes is
-looked at twice and counted once), `cpu_seconds_once` of everything else; `peak_mb` is the process's.
+fit would, `--drift` lets the camera's exposure wander (gain +-25 %, gamma +-0.1). One JSON line per capture and setting
+of `--vary`, after one that names the machine. Shares are of the surface; errors are mean absolute differences, of 255,
+from the true pictures: `texel_l1` of seen texels in the front camera, `unseen_l1` of texels that were never seen, in
+each camera. `seam` is how much more neighbouring texels differ where they come from different frames than where they
+come from one. `selfcheck` hides what was seen and lets the fillings compete: on one side of the body, whose other side
+symmetry may copy, and in patches on both. Seconds are of the loop over frames (a frame that votes is looked at twice
+and counted once); `cpu_seconds_once` is everything else; `peak_mb` is the process's.
 """
 
 from __future__ import annotations
@@ -24,11 +26,15 @@ from numpy.typing import NDArray
 
 from ahoy_core.body.packaged import PackagedBody, load_packaged_body
 from ahoy_core.cost import Bill, Meter, machine
+from ahoy_core.roles import COMPLETIONS
+from ahoy_core.texture.atlas import ObservedAtlas
 from ahoy_core.texture.inputs import TextureConfig
+from ahoy_core.texture.links import texel_links
 from ahoy_core.texture.rays import Caster, hit_map, to_camera
+from ahoy_core.texture.selfcheck import patches, score_fillings, side_of
 from ahoy_core.texture.surface import Surface, interpolate_uv
-from ahoy_core.texture.texels import pad_charts, sample_atlas
-from ahoy_core.texture.texture import Texture, build_texture
+from ahoy_core.texture.texels import TexelMap, pad_charts, sample_atlas, texel_map, texel_normals
+from ahoy_core.texture.texture import Texture, build_texture, canonical_vertices
 from benchmarks.captures import Capture, capture_folders, posed_vertices, read_capture, true_fit
 
 Fit = Mapping[str, NDArray[np.generic]]
@@ -36,7 +42,18 @@ OPAQUE = 250  # of 255: pixels on the true outline mix in the background
 SURELY_SEEN = 0.9  # of 1: share of seen texels in what a bilinear lookup reads
 
 
-def measure(capture: Capture, body: PackagedBody, config: TextureConfig, shift_m: float) -> dict[str, Any]:
+def drifting(frames: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The clip as a camera with a wandering exposure would have recorded it."""
+    phase = 2 * np.pi * np.arange(len(frames)) / len(frames)
+    gain, gamma = 1 + 0.25 * np.sin(1.5 * phase), 1 + 0.1 * np.sin(2.5 * phase)
+    levels = np.arange(256) / 255
+    tables = np.clip(np.rint(255 * gain[:, None] * levels ** gamma[:, None]), 0, 255).astype(np.uint8)
+    return np.stack([table[frame] for table, frame in zip(tables, frames, strict=True)])
+
+
+def measure(
+    capture: Capture, body: PackagedBody, config: TextureConfig, shift_m: float, drift: bool, check: bool
+) -> dict[str, Any]:
     """Make one texture and compare it with the true pictures."""
     truth = true_fit(capture, body)
     noise = np.random.default_rng(0).normal(0, shift_m, truth["transl"].shape).astype(np.float32)
@@ -44,7 +61,12 @@ def measure(capture: Capture, body: PackagedBody, config: TextureConfig, shift_m
     clock: list[Bill] = []
     with Meter() as meter:
         texture = build_texture(
-            capture.frames, capture.visible, fit, body, config, lambda done, total: clock.append(meter.read())
+            drifting(capture.frames) if drift else capture.frames,
+            capture.visible,
+            fit,
+            body,
+            config,
+            lambda done, total: clock.append(meter.read()),
         )
     bill = meter.read()
     # The first call ends a frame that includes what is prepared once, so the loop is measured from there on.
@@ -52,8 +74,6 @@ def measure(capture: Capture, body: PackagedBody, config: TextureConfig, shift_m
     cpu_s = (clock[-1].cpu_s - clock[0].cpu_s) * per_frame
     return {
         "capture": capture.folder.name,
-        "mode": config.mode,
-        "align_px": config.align_px,
         "seconds_per_frame": round((clock[-1].wall_s - clock[0].wall_s) * per_frame, 4),
         "cpu_seconds_per_frame": round(cpu_s, 4),
         "cpu_seconds_once": round(bill.cpu_s - cpu_s * len(capture.frames), 2),
@@ -61,8 +81,46 @@ def measure(capture: Capture, body: PackagedBody, config: TextureConfig, shift_m
         "observed": round(texture.notes["observed_share"], 3),
         "mirrored": round(texture.notes["mirrored_share"], 3),
         "diffused": round(texture.notes["diffused_share"], 3),
+        "seam": seam(body, truth, texture),
         **colour_scores(capture, body, truth, texture),
+        **({"selfcheck": self_check(body, truth, texture)} if check else {}),
     }
+
+
+def _texels(body: PackagedBody, fit: Fit, texture: Texture) -> tuple[Surface, TexelMap, NDArray[np.float32]]:
+    surface = Surface.of(body)
+    return surface, texel_map(surface, len(texture.chart)), canonical_vertices(body, fit["betas"])
+
+
+def seam(body: PackagedBody, fit: Fit, texture: Texture) -> float:
+    """Mean absolute difference, of 255, of neighbouring seen texels from different frames, beyond that within one."""
+    surface, texels, vertices = _texels(body, fit, texture)
+    pairs = texel_links(texels, texels.points(vertices, surface.faces), texel_normals(texels, vertices, surface))
+    source, rgb = texture.source_frame.ravel()[texels.flat], texture.observed_rgb.reshape(-1, 3)[texels.flat]
+    pairs = pairs[(source[pairs] >= 0).all(axis=1)]
+    step = np.abs(rgb[pairs[:, 0]].astype(np.float64) - rgb[pairs[:, 1]]).mean(axis=1)
+    apart = source[pairs[:, 0]] != source[pairs[:, 1]]
+    return round(float(step[apart].mean() - step[~apart].mean()), 2) if apart.any() and (~apart).any() else 0.0
+
+
+def self_check(body: PackagedBody, fit: Fit, texture: Texture) -> dict[str, Any]:
+    """Errors of the fillings on hidden regions, by region hidden and filling."""
+    surface, texels, vertices = _texels(body, fit, texture)
+    points = texels.points(vertices, surface.faces)
+    observed = ObservedAtlas(texture.observed_rgb, texture.coverage, texture.source_frame)
+    regions = {
+        "left side": side_of(points, vertices, left=True),
+        "right side": side_of(points, vertices, left=False),
+        "patches": patches(points, vertices, count=12, radius=0.08, rng=np.random.default_rng(0)),
+    }
+    found = {}
+    for name, hidden in regions.items():
+        scores = score_fillings(observed, surface, texels, vertices, hidden, COMPLETIONS)
+        found[name] = {
+            filling: {"l1": round(score.l1, 1), **{part: round(error, 1) for part, error in score.by_part.items()}}
+            for filling, score in scores.items()
+        }
+    return found
 
 
 def colour_scores(capture: Capture, body: PackagedBody, fit: Fit, texture: Texture) -> dict[str, float]:
@@ -70,6 +128,7 @@ def colour_scores(capture: Capture, body: PackagedBody, fit: Fit, texture: Textu
     surface = Surface.of(body)
     seen_texels = pad_charts((texture.coverage > 0).astype(np.float32), texture.chart)
     front: list[NDArray[np.float64]] = []
+    unseen: dict[str, list[NDArray[np.float64]]] = {name: [] for name in capture.cameras}
     errors: list[NDArray[np.float64]] = []
     known: list[NDArray[np.bool_]] = []
     for frame in capture.scored_frames():
@@ -85,11 +144,13 @@ def colour_scores(capture: Capture, body: PackagedBody, fit: Fit, texture: Textu
             seen = sample_atlas(seen_texels, uv)
             errors.append(error)
             known.append(seen > 0.5)
+            unseen[name].append(error[seen <= 0.5])
             if name == "front":
                 front.append(error[seen > SURELY_SEEN])
     every, is_seen = np.concatenate(errors), np.concatenate(known)
     return {
-        "colour_error": round(float(np.abs(np.concatenate(front)).mean()), 1),
+        "texel_l1": round(float(np.abs(np.concatenate(front)).mean()), 2),
+        "unseen_l1": {name: round(float(np.abs(np.concatenate(rows)).mean()), 1) for name, rows in unseen.items()},
         "psnr_seen": round(_psnr(every[is_seen]), 2),
         "psnr_filled": round(_psnr(every[~is_seen]), 2),
     }
@@ -107,18 +168,26 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument(
         "--shift-m", type=float, default=0.0, help="noise of the body's place, metres an axis and frame"
     )
+    parser.add_argument(
+        "--vary", nargs="*", default=[], metavar="KNOB=A,B,...", help="knobs to take every combination of"
+    )
+    parser.add_argument("--drift", action="store_true", help="let the exposure wander over the clip")
+    parser.add_argument("--selfcheck", action="store_true", help="let the fillings compete on hidden regions")
     parser.add_argument("--threads", type=int, default=1)
     options = parser.parse_args(arguments)
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     torch.set_num_threads(options.threads)
-    config = TextureConfig.model_validate_strings(dict(pair.split("=", 1) for pair in options.set))
+    given = dict(pair.split("=", 1) for pair in options.set)
+    varied = {knob: values.split(",") for knob, values in (pair.split("=", 1) for pair in options.vary)}
     body = load_packaged_body()
-    lines = [json.dumps({"machine": machine(), "set": options.set, "shift_m": options.shift_m})]
+    lines = [json.dumps({"machine": machine(), "set": given, "shift_m": options.shift_m, "drift": options.drift})]
     for folder in capture_folders(options.captures):
         capture = read_capture(folder)
-        for mode, align_px in product(("first", "best"), dict.fromkeys((config.align_px, 0.0))):
-            setting = config.model_copy(update={"mode": mode, "align_px": align_px})
-            lines.append(json.dumps(measure(capture, body, setting, options.shift_m)))
+        for values in product(*varied.values()):
+            setting = dict(zip(varied, values, strict=True))
+            config = TextureConfig.model_validate_strings({**given, **setting})
+            row = measure(capture, body, config, options.shift_m, options.drift, options.selfcheck)
+            lines.append(json.dumps({"capture": row.pop("capture"), **setting, **row}))
             print(lines[-1], flush=True)
     if options.json:
         options.json.write_text("\n".join(lines) + "\n", encoding="utf-8")

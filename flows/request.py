@@ -74,7 +74,16 @@ class VideoRequest(BaseModel):
         """Name this attempt; its results go to `store`, opened here unless given."""
         store = store or self.open_store()
         run_id = uuid.uuid4().hex[:12]
-        return Run(store, Tables(store), self.batch, video_id, run_id, observer, attempt_number=self.attempt)
+        return Run(
+            store,
+            Tables(store),
+            self.batch,
+            video_id,
+            run_id,
+            observer,
+            self.settings().body,
+            attempt_number=self.attempt,
+        )
 
 
 def source_cache() -> Path:

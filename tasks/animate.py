@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from ahoy_core.animate import evenly_chosen, motion_frames, turntable
 from ahoy_core.avatar.files import load_avatar
-from ahoy_core.body.packaged import load_packaged_body
+from ahoy_core.body.load import load_body
 from ahoy_core.formats.images import contact_sheet, write_png
 from ahoy_core.formats.ply import write_ply
 from ahoy_core.formats.video import write_mp4
@@ -40,7 +40,7 @@ class AnimateConfig(BaseModel):
 
 def run_animate(config: AnimateConfig, ctx: StageContext) -> StageOutput:
     """Render both videos and export the canonical avatar."""
-    avatar, body = load_avatar(ctx.inputs["coarse"]), load_packaged_body()
+    avatar, body = load_avatar(ctx.inputs["coarse"]), load_body(ctx.body)
     label = {"comment": avatar.info.synthetic_media, "title": "Ahoy avatar"}
     total = config.turntable_frames + config.motion_frames
     ctx.progress(0, total, "turntable")

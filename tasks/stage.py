@@ -19,10 +19,13 @@ from typing import Any, Protocol
 
 from pydantic import BaseModel
 
+from ahoy_core.body.load import PACKAGED
 from ahoy_core.cost.meter import Bill, Meter
 from storage_schema.keys import stage_key
 from storage_schema.store import ArtifactStore, Manifest
 from storage_schema.tables import Tables
+from tasks.role import Role as Role
+from tasks.roles import body_role
 
 LEASE_S = (
     60.0  # a killed worker's stage may be taken over after this; the holder renews it; correctness does not rest on it
@@ -51,15 +54,6 @@ class Observer(Protocol):
 
 
 @dataclass(frozen=True)
-class Role:
-    """Who filled a role (pose, mask, body, ...): shown in the report; `weights_sha256` is part of the stage's key."""
-
-    name: str
-    licence: str
-    weights_sha256: str = ""
-
-
-@dataclass(frozen=True)
 class StageOutput:
     """What a stage's function returns beside the files it wrote.
 
@@ -78,12 +72,13 @@ class StageOutput:
 
 @dataclass(frozen=True)
 class StageContext:
-    """Where a stage's function finds its inputs and puts its outputs."""
+    """Where a stage's function finds its inputs and puts its outputs, and which body fills that role."""
 
     inputs: Mapping[str, Path]
     manifests: Mapping[str, Manifest]
     out: Path
     progress: ProgressFn
+    body: str = PACKAGED
 
 
 @dataclass(frozen=True)
@@ -146,9 +141,10 @@ class Source:
 
 @dataclass(frozen=True)
 class Run:
-    """One attempt at one video: where its artifacts and rows go, and who watches.
+    """One attempt at one video: where its artifacts and rows go, who watches, and which body is used.
 
     Attributes:
+        body: a name or the path of a file; keys know it by its contents alone, so it is no knob of a stage.
         take_slots: waits for one slot of each named resource and holds them while its block runs.
         attempt_number: of the video in its batch, from 1.
         sequence: numbers the rows of this run, so that their order does not rest on a clock.
@@ -160,6 +156,7 @@ class Run:
     video_id: str
     run_id: str
     observer: Observer
+    body: str = PACKAGED
     take_slots: Callable[[Sequence[str]], AbstractContextManager[Any]] = lambda names: nullcontext()
     attempt_number: int = 1
     sequence: Iterator[int] = field(default_factory=itertools.count)
@@ -177,7 +174,10 @@ def run_stage(stage: Stage, config: BaseModel, inputs: Mapping[str, StageRef | S
             f"stage {stage.name}: expected inputs {stage.needs}, got no {sorted(missing)}; run those stages first"
         )
     hashes = {name: inputs[name].content_hash for name in stage.needs}
-    roles = {role: dataclasses.asdict(filled) for role, filled in stage.roles(config).items()}
+    filled_by = dict(stage.roles(config))
+    if "body" in filled_by:
+        filled_by["body"] = body_role(run.body)
+    roles = {role: dataclasses.asdict(filled) for role, filled in filled_by.items()}
     key = stage_key(
         stage.name,
         stage.version,
@@ -232,7 +232,7 @@ def _make(
             def progress(done: int, total: int, note: str = "") -> None:
                 run.observer.progress(stage.name, done, total, note)
 
-            output = stage.run(config, StageContext(folders, manifests, attempt.dir, progress))
+            output = stage.run(config, StageContext(folders, manifests, attempt.dir, progress, run.body))
             bill = meter.read()
             manifest = attempt.commit(
                 stage_version=stage.version,

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ahoy_core.body.packaged import load_packaged_body
+from ahoy_core.body.load import load_body
 from ahoy_core.formats.images import contact_sheet, write_png
 from ahoy_core.formats.npz import load_npz, save_npz
 from ahoy_core.texture.texture import Texture, TextureConfig, build_texture
@@ -24,7 +24,7 @@ def run_texture(config: TextureConfig, ctx: StageContext) -> StageOutput:
     frames = load_npz(ctx.inputs["ingest"] / "frames.npz", ["frames"])["frames"]
     visible = load_npz(ctx.inputs["perceive"] / "masks.npz", ["visible"])["visible"]
     fit = load_npz(ctx.inputs["perceive"] / "body.npz")
-    body = load_packaged_body()
+    body = load_body(ctx.body)
     texture = build_texture(frames, visible, fit, body, config, lambda done, total: ctx.progress(done, total, "frames"))
     save_npz(ctx.out / "atlas.npz", texture.atlas_arrays(), compress=True)
     save_npz(ctx.out / "canonical.npz", texture.canonical_arrays(), compress=True)
@@ -71,9 +71,9 @@ def _roles(config: TextureConfig) -> Mapping[str, Role]:
     return {
         "body": packaged_body(),
         "surface": ours("ray-cast of the fitted body"),
-        "inpaint": ours("symmetry and diffusion over the body's surface"),
+        "inpaint": ours("symmetry and harmonic filling over the body's surface, part by part"),
         "views": ours("renders of the textured body"),
     }
 
 
-TEXTURE = Stage("texture", 1, TextureConfig, ("ingest", "perceive"), run_texture, _roles)
+TEXTURE = Stage("texture", 2, TextureConfig, ("ingest", "perceive"), run_texture, _roles)

@@ -14,9 +14,18 @@ from ahoy_core.body.rotations import matrix_to_axis_angle
 
 ARM_ANGLE: Final = math.radians(45)  # of the arm below the horizontal
 LEG_ANGLE: Final = math.radians(7)  # of the leg from the vertical, outwards: feet about as far apart as the shoulders
-# Joint, and the joint or landmark that its bone points to.
-_ARM = (("upperarm01", "lowerarm01"), ("lowerarm01", "wrist"), ("wrist", "finger3-1"))
-_LEG = (("upperleg01", "lowerleg01"), ("lowerleg01", "foot"))
+# Joint, and the joint that its bone points to, for one side: what the packaged body and the SMPL family call them; the
+# first name that a body has is taken.
+_ARM = (
+    (("upperarm01.L", "left_shoulder"), ("lowerarm01.L", "left_elbow")),
+    (("lowerarm01.L", "left_elbow"), ("wrist.L", "left_wrist")),
+    (("wrist.L", "left_wrist"), ("finger3-1.L", "left_middle1", "left_hand")),
+)
+_LEG = (
+    (("upperleg01.L", "left_hip"), ("lowerleg01.L", "left_knee")),
+    (("lowerleg01.L", "left_knee"), ("foot.L", "left_ankle")),
+)
+_FOOT = (("foot.L", "left_ankle"), ("toe3-1.L", "left_foot"))
 
 
 def canonical_pose(body: BodyModel) -> Tensor:
@@ -36,10 +45,10 @@ def canonical_pose(body: BodyModel) -> Tensor:
         leg = torch.tensor([sign * math.sin(LEG_ANGLE), 0.0, -math.cos(LEG_ANGLE)], dtype=torch.float64)
         for bones, direction in ((_ARM, down), (_LEG, leg)):
             for start, end in bones:
-                a, b = _index(body, f"{start}.{side}"), _index(body, f"{end}.{side}")
+                a, b = _index(body, start, side), _index(body, end, side)
                 fixed[a] = _rotation_between(rest[0, b] - rest[0, a], direction)
-        foot = _index(body, f"foot.{side}")
-        fixed[foot] = _forward(rest[0, _index(body, f"toe3-1.{side}")] - rest[0, foot])
+        foot, toes = (_index(body, names, side) for names in _FOOT)
+        fixed[foot] = _forward(rest[0, toes] - rest[0, foot])
     for joint, parent in enumerate(body.parents):
         turns[joint] = fixed[joint] if joint in fixed else (turns[parent] if parent >= 0 else turns[joint])
     pose = matrix_to_axis_angle(local_rotations(turns[None], body.parents))[0]
@@ -54,10 +63,14 @@ def canonical_transl(body: BodyModel, betas: Tensor | None = None) -> Tensor:
     return torch.stack([-root[0], -root[1], -output.vertices[0, :, 2].min()]).detach()
 
 
-def _index(body: BodyModel, name: str) -> int:
-    if name not in body.joint_names:
-        raise ValueError(f"expected a body with joint {name!r} for the canonical pose, got {body.name!r} without it")
-    return body.joint_names.index(name)
+def _index(body: BodyModel, names: tuple[str, ...], side: str) -> int:
+    """The joint that a body has of some names, given for the left side; side "L" or "R"."""
+    if side == "R":
+        names = tuple(name.replace(".L", ".R").replace("left_", "right_") for name in names)
+    for name in names:
+        if name in body.joint_names:
+            return body.joint_names.index(name)
+    raise ValueError(f"expected a body with a joint {' or '.join(names)} for the canonical pose, got {body.name!r}")
 
 
 def _rotation_between(a: Tensor, b: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Poses across bodies: `convert_pose` is the only bridge (captures' full rig, the packaged body; SMPL-X, AMASS, BVH).
+"""Poses across bodies: `convert_pose` is the only bridge (captures' full rig, the packaged body, the SMPL family).
 
 A pose is a set of joint rotations over a rest pose. What carries over is each joint's rotation in the world: where two
 skeletons share their rest pose, as a rig and its reduced form do, it carries over as it is; where they don't (T-pose
@@ -7,7 +7,7 @@ against A-pose), it is first turned by the swing that takes the target's rest bo
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import torch
@@ -17,6 +17,7 @@ from ahoy_core.body.lbs import forward_kinematics, global_rotations, local_rotat
 from ahoy_core.body.model import BodyModel
 from ahoy_core.body.packaged import PackagedBody
 from ahoy_core.body.rotations import axis_angle_to_matrix, matrix_to_axis_angle, nearest_rotation
+from ahoy_core.body.smpl_names import JOINT_NAMES, is_limb, packaged_from_smpl, smpl_from_packaged, within_smpl
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,11 @@ class SkeletonPose:
 
 
 def convert_pose(
-    source: Skeleton, target: Skeleton, pose: SkeletonPose, joints: Mapping[str, str] | None = None
+    source: Skeleton,
+    target: Skeleton,
+    pose: SkeletonPose,
+    joints: Mapping[str, str] | None = None,
+    aligned: Callable[[str], bool] = lambda name: True,
 ) -> SkeletonPose:
     """Carries poses from one skeleton to another.
 
@@ -68,6 +73,8 @@ def convert_pose(
         joints: target joint -> source joint, for joints of different names; by default joints of equal names. The roots
             always correspond. A target joint without a source keeps its rest rotation relative to its parent; the
             rotation of a source joint without a target is passed on to its descendants.
+        aligned: of a target joint's name, whether its rest bone is to be swung onto the source's. Where both rest poses
+            agree but their joints are placed differently (a spine, a foot), it should not be.
 
     Returns:
         T poses of `target`, with the source's root position.
@@ -80,7 +87,7 @@ def convert_pose(
         raise ValueError(f"expected rotations {expected} of the source skeleton, got {tuple(pose.rotations.shape)}")
     pairs = _pairs(source, target, joints)
     world = global_rotations(pose.rotations, source.parents)
-    swings = _swings(source, target, pairs).to(world)
+    swings = _swings(source, target, pairs, aligned).to(world)
     turned: list[Tensor] = []
     for joint, parent in enumerate(target.parents):
         turned.append(world[:, pairs[joint]] @ swings[joint] if joint in pairs else turned[parent])
@@ -98,18 +105,24 @@ def _pairs(source: Skeleton, target: Skeleton, joints: Mapping[str, str] | None)
     return {**named, 0: 0}
 
 
-def _swings(source: Skeleton, target: Skeleton, pairs: Mapping[int, int]) -> Tensor:
-    """[J,3,3]: the least rotations that take the target's rest bones onto the source's; identity for joints without."""
+def _swings(source: Skeleton, target: Skeleton, pairs: Mapping[int, int], aligned: Callable[[str], bool]) -> Tensor:
+    """[J,3,3]: the least rotations that take the target's rest bones onto the source's; identity for joints without.
+
+    A joint with several children (wrist) or none (finger tip) has no bone of its own and swings with its parent.
+    """
     swings = torch.eye(3, dtype=torch.float64).repeat(len(target.parents), 1, 1)
     if source.rest_pose == target.rest_pose:
         return swings
-    for joint in pairs:
+    for joint in sorted(pairs):
+        if joint == 0 or not aligned(target.joint_names[joint]):
+            continue
         children = [c for c in pairs if c != joint and _next_paired(target, c, pairs) == joint]
-        # A joint with several children (pelvis, chest, wrist) has no bone of its own: its rotation is taken as it is.
-        if len(children) == 1 and joint != 0:
+        if len(children) == 1:
             there = source.rest_joints[pairs[children[0]]] - source.rest_joints[pairs[joint]]
             here = target.rest_joints[children[0]] - target.rest_joints[joint]
             swings[joint] = _swing(here.double(), there.double())
+        else:
+            swings[joint] = swings[_next_paired(target, joint, pairs)]
     return swings
 
 
@@ -136,7 +149,54 @@ def body_skeleton(body: BodyModel, betas: Tensor | None = None) -> Skeleton:
     """A body's skeleton, for a shape [S] (an average adult by default)."""
     betas = (body.default_betas if betas is None else betas)[None]
     still = betas.new_zeros(1, body.n_joints, 3)
-    return Skeleton(body.joint_names, body.parents, body(still, betas, still[:, 0]).rest_joints[0].detach(), body.name)
+    rest = body(still, betas, still[:, 0]).rest_joints[0].detach()
+    return Skeleton(body.joint_names, body.parents, rest, "T of SMPL" if _is_smpl(body.joint_names) else body.name)
+
+
+def convert_body_pose(
+    source: BodyModel,
+    target: BodyModel,
+    pose: Tensor,
+    transl: Tensor,
+    source_betas: Tensor | None = None,
+    target_betas: Tensor | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Poses of one body -> poses of another: the packaged body, SMPL, SMPL+H and SMPL-X, any to any.
+
+    World rotations carry over (a turn of the whole body exactly), rest bones of arms and legs are aligned (A-pose
+    against T-pose), and the roots stand at the same place. Joints without a partner rest: twist bones, palms, toes past
+    the first, all of SMPL's fingers.
+
+    Args:
+        source: the body that the poses belong to.
+        target: the body wanted.
+        pose: [T,J,3] axis-angle.
+        transl: [T,3] metres.
+        source_betas: [S] shape, an average adult by default.
+        target_betas: [S'] likewise.
+
+    Returns:
+        pose [T,J',3] axis-angle and transl [T,3] metres.
+    """
+    here, there = body_skeleton(source, source_betas), body_skeleton(target, target_betas)
+    rest = here.rest_joints[0].to(transl)
+    posed = SkeletonPose(axis_angle_to_matrix(pose), transl + rest)
+    converted = convert_pose(here, there, posed, joint_map(target.joint_names, source.joint_names), is_limb)
+    return matrix_to_axis_angle(converted.rotations), converted.root - there.rest_joints[0].to(transl)
+
+
+def joint_map(target_names: tuple[str, ...], source_names: tuple[str, ...]) -> dict[str, str] | None:
+    """Target joint -> source joint between the bodies we know; None (equal names) for two of the same family."""
+    to_smpl, from_smpl = _is_smpl(target_names), _is_smpl(source_names)
+    if to_smpl and from_smpl:
+        return within_smpl(target_names, source_names)
+    if to_smpl:
+        return smpl_from_packaged(target_names)
+    return packaged_from_smpl(source_names) if from_smpl else None
+
+
+def _is_smpl(joint_names: tuple[str, ...]) -> bool:
+    return joint_names[0] == JOINT_NAMES["smpl"][0]
 
 
 def rig_skeleton(body: PackagedBody) -> Skeleton:

@@ -9,6 +9,20 @@ import torch
 from torch import Tensor
 
 
+def normalize_weights(lbs_weights: Tensor) -> Tensor:
+    """Skin weights [...,J] >= 0 with rows that sum to 1; a row that sums to (next to) nothing follows the root.
+
+    Files are rounded, networks start anywhere: a row of zeros would drag its point to the world's origin. Gradients are
+    finite in every row and zero in rows of zeros.
+    """
+    tiny = torch.finfo(lbs_weights.dtype).tiny ** 0.5  # its square, which the gradient divides by, is still normal
+    total = lbs_weights.sum(-1, keepdim=True)
+    empty = total <= tiny
+    root = torch.zeros_like(lbs_weights)
+    root[..., 0] = 1
+    return torch.where(empty, root, lbs_weights / torch.where(empty, torch.ones_like(total), total))
+
+
 def blend_transforms(lbs_weights: Tensor, transforms: Tensor) -> Tensor:
     """Blends joint transforms by skin weights: sum_j w_nj T_bj.
 

@@ -17,7 +17,8 @@ class BodyOutput:
         vertices: [B,V,3] posed, world, metres.
         joints: [B,J,3] posed, world, metres.
         transforms: [B,J,4,4] rest space -> world, what skinning blends.
-        rest_vertices: [B,V,3] shaped (betas and expression), rest pose.
+        rest_vertices: [B,V,3] shaped (betas, expression, and pose blend shapes where the body has them), rest pose:
+            skinning them by `transforms` gives `vertices`.
         rest_joints: [B,J,3] shaped, rest pose.
     """
 

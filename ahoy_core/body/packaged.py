@@ -14,7 +14,7 @@ import torch
 from safetensors.numpy import load
 from torch import Tensor
 
-from ahoy_core.body.lbs import forward_kinematics, lbs
+from ahoy_core.body.lbs import forward_kinematics, lbs, normalize_weights
 from ahoy_core.body.model import BodyOutput
 from ahoy_core.body.phenotype import BETA_NAMES, corner_weights
 from ahoy_core.body.regions import vertex_regions
@@ -243,7 +243,7 @@ def unpack(arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any], dtype: tor
         faces=faces,
         uvs=real("uvs"),
         uv_faces=index("uv_faces"),
-        lbs_weights=weights / weights.sum(1, keepdim=True),
+        lbs_weights=normalize_weights(weights),
         regions=vertex_regions(faces, face_regions, len(weights)),
         face_regions=face_regions,
         landmark_indices=index("landmark_indices"),

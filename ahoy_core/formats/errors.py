@@ -65,3 +65,7 @@ class NpzError(ValueError):
 
 class ImageError(ValueError):
     """An image file cannot be read or an array cannot be written as an image."""
+
+
+class BodyFileError(ValueError):
+    """A file of a licensed body (SMPL, SMPL+H, SMPL-X) or its texture coordinates cannot be used."""

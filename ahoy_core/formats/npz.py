@@ -81,6 +81,20 @@ def load_npz(path: str | Path, names: Iterable[str] | None = None) -> dict[str, 
         ) from error
 
 
+def npz_names(path: str | Path) -> tuple[str, ...]:
+    """Names of the arrays in a `.npz` file; none of them is read.
+
+    Raises:
+        FileNotFoundError: no such file.
+        NpzError: not a `.npz`.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return tuple(name.removesuffix(".npy") for name in archive.namelist())
+    except zipfile.BadZipFile as error:
+        raise NpzError(f"expected a .npz archive, got {Path(path).name!r} ({error}): make it again") from error
+
+
 def _normalised(array: np.ndarray) -> np.ndarray:
     """Little-endian, C order, same shape (also for zero-dimensional arrays)."""
     values = np.asarray(array)

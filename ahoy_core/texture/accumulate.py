@@ -11,6 +11,7 @@ import torch
 from ahoy_core.body.model import BodyModel
 from ahoy_core.texture.atlas import AtlasAccumulator, ObservedAtlas
 from ahoy_core.texture.consensus import LEAST_VOTES, Consensus, Votes
+from ahoy_core.texture.exposure import Exposure
 from ahoy_core.texture.inputs import TextureConfig
 from ahoy_core.texture.rays import FloatArray, IntArray
 from ahoy_core.texture.surface import REFERENCE_HEIGHT, SeenFrame, Surface, height_in_pixels, look, trust
@@ -26,10 +27,26 @@ VOTING_FRAMES = 16
 
 @dataclass(frozen=True)
 class Log:
-    """By frame number: texels written, and the shift (x, y in pixels) found before writing."""
+    """By frame number: texels written, the shift found (x, y in pixels), the mean gain where exposure was changed."""
 
     written: dict[int, int] = field(default_factory=dict)
     shifts: dict[int, tuple[float, float]] = field(default_factory=dict)
+    gains: dict[int, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Look:
+    """One frame about to be read.
+
+    Its number, how it is seen (None: its body is not finite), its picture [H,W,3] uint8 at the atlas's exposure, and
+    what was changed for that.
+    """
+
+    number: int
+    seen: SeenFrame | None
+    image: IntArray
+    shift: tuple[float, float] = (0.0, 0.0)
+    exposure: Exposure | None = None
 
 
 @dataclass(frozen=True)
@@ -61,34 +78,43 @@ def accumulate(
     consensus = None
     if voters:
         votes, atlas = Votes(len(texels.face), len(voters)), _atlas(clip, texels, None)
-        for t, seen, _ in _looks(clip, atlas, voters):
-            if seen is not None:
-                texel, rgb, _, _ = atlas.read(clip.frames[t], clip.visible[t], seen)
+        gains = []
+        for view in _looks(clip, atlas, voters):
+            if view.seen is not None:
+                gains.append(np.ones(3) if view.exposure is None else view.exposure.gain)
+                texel, rgb, _, _ = atlas.read(view.image, clip.visible[view.number], view.seen)
                 votes.add(texel, rgb)
-                atlas.add(t, clip.frames[t], clip.visible[t], seen)
+                atlas.add(view.number, view.image, clip.visible[view.number], view.seen)
             done = _report(progress, done, total)
-        consensus = votes.consensus(points, config.outlier_levels)
+        # 0 levels: everything is written, and the consensus only ranks it.
+        consensus = votes.consensus(points, config.outlier_levels or 255.0)
+        if gains:
+            # So far everything has the first frame's exposure; the clip's is that of its middle one.
+            consensus = consensus.scaled(1 / np.median(gains, axis=0))
     atlas, log = _atlas(clip, texels, consensus), Log()
     weights, fit = clip.body.lbs_weights.cpu().numpy(), clip.fit
-    for t, seen, shift in _looks(clip, atlas, chosen):
-        log.shifts[t], log.written[t] = shift, 0
-        if seen is not None:
+    for view in _looks(clip, atlas, chosen):
+        t = view.number
+        log.shifts[t], log.written[t] = view.shift, 0
+        if view.exposure is not None:
+            log.gains[t] = float(view.exposure.gain.mean())
+        if view.seen is not None:
             confidence = fit["frame_confidence"][t] * (weights @ fit["joint_confidence"][t])
             floor = config.min_joint_confidence * float(fit["frame_confidence"][t])
-            log.written[t] = atlas.add(t, clip.frames[t], clip.visible[t], seen, confidence, floor)
+            log.written[t] = atlas.add(t, view.image, clip.visible[t], view.seen, confidence, floor)
         done = _report(progress, done, total)
     return atlas.result(), log
 
 
 def _voters(chosen: list[int], config: TextureConfig) -> list[int]:
-    if config.outlier_levels == 0 or len(chosen) < LEAST_VOTES:
+    if (config.outlier_levels == 0 and config.rule != "median") or len(chosen) < LEAST_VOTES:
         return []
     rows = np.unique(np.linspace(0, len(chosen) - 1, min(VOTING_FRAMES, len(chosen))).round().astype(int))
     return [chosen[row] for row in rows]
 
 
 def _atlas(clip: Clip, texels: TexelMap, consensus: Consensus | None) -> AtlasAccumulator:
-    return AtlasAccumulator(clip.surface, texels, clip.config.mode, clip.config.grazing_cos, consensus)
+    return AtlasAccumulator(clip.surface, texels, clip.config.rule, clip.config.grazing_cos, consensus)
 
 
 def _report(progress: Progress | None, done: int, total: int) -> int:
@@ -97,30 +123,24 @@ def _report(progress: Progress | None, done: int, total: int) -> int:
     return done + 1
 
 
-def _looks(
-    clip: Clip, atlas: AtlasAccumulator, numbers: list[int]
-) -> Iterator[tuple[int, SeenFrame | None, tuple[float, float]]]:
-    """Frames looked at and moved to where they agree with the atlas; None for a frame whose body is not finite."""
+def _looks(clip: Clip, atlas: AtlasAccumulator, numbers: list[int]) -> Iterator[Look]:
+    """Frames looked at, moved and lit as they agree best with the atlas."""
     config, K = clip.config, clip.fit["K"]
     for t, vertices in _posed(clip, numbers):
+        image, visible = clip.frames[t], clip.visible[t]
         if not np.isfinite(vertices).all():
-            yield t, None, (0.0, 0.0)
+            yield Look(t, None, image)
             continue
-        seen = look(
-            clip.surface,
-            vertices,
-            clip.fit["viewmat"],
-            K,
-            clip.visible[t],
-            grazing_cos=config.grazing_cos,
-            boundary_px=config.boundary_px,
-        )
+        grazing, boundary = config.grazing_cos, config.boundary_px
+        view = clip.fit["viewmat"]
+        seen = look(clip.surface, vertices, view, K, visible, grazing_cos=grazing, boundary_px=boundary)
+        exposure = atlas.exposure(image, seen, config.exposure)
+        image = image if exposure is None else exposure.apply(image)
         reach = config.align_px * height_in_pixels(seen.hits) / REFERENCE_HEIGHT
-        shift = atlas.shift(clip.frames[t], seen, reach)
+        shift = atlas.shift(image, seen, reach)
         if shift != (0.0, 0.0):
-            moved = _shifted(K, shift)
-            seen = trust(clip.surface, seen.caster, moved, clip.visible[t], config.grazing_cos, config.boundary_px)
-        yield t, seen, shift
+            seen = trust(clip.surface, seen.caster, _shifted(K, shift), visible, grazing, boundary)
+        yield Look(t, seen, image, shift, exposure)
 
 
 def _shifted(K: FloatArray, shift: tuple[float, float]) -> FloatArray:

@@ -13,11 +13,12 @@ import numpy as np
 
 from ahoy_core.texture.align import best_shift
 from ahoy_core.texture.consensus import Consensus
+from ahoy_core.texture.exposure import Exposure, ExposureMatch, match_exposure
 from ahoy_core.texture.rays import BoolArray, FloatArray, IntArray, to_pixels, view_cosines
 from ahoy_core.texture.surface import SeenFrame, Surface
 from ahoy_core.texture.texels import TexelMap, sample_image
 
-WriteMode = Literal["first", "best"]
+WriteRule = Literal["first", "best", "median"]
 
 # A margin this many times the asked boundary is as good as any: beyond it, only angle, alpha and confidence rank
 # views ("best").
@@ -54,9 +55,10 @@ class AtlasAccumulator:
     Args:
         surface: the body's triangles.
         texels: the atlas's texels on them.
-        mode: "first": the first frame that shows a texel decides (the paper's rule, no blending over time). "best":
+        rule: "first": the first frame that shows a texel decides (the paper's rule, no blending over time). "best":
             the frame with the best view of it does, by angle, mask alpha, distance to the nearest boundary and
-            confidence.
+            confidence. "median": the frame whose colour is nearest to the consensus does, which no passing shadow or
+            reflection is; without a consensus of the texel, the best view.
         grazing_cos: smallest trusted cosine between normal and view, as given to `look`.
         consensus: what most frames show; colours that contradict it are not written. None: everything is written.
     """
@@ -65,11 +67,11 @@ class AtlasAccumulator:
         self,
         surface: Surface,
         texels: TexelMap,
-        mode: WriteMode = "first",
+        rule: WriteRule = "first",
         grazing_cos: float = 0.3,
         consensus: Consensus | None = None,
     ) -> None:
-        self.surface, self.texels, self.mode, self.grazing_cos = surface, texels, mode, grazing_cos
+        self.surface, self.texels, self.rule, self.grazing_cos = surface, texels, rule, grazing_cos
         self.consensus = consensus
         count = len(texels.face)
         self._rgb = np.zeros((count, 3), dtype=np.uint8)
@@ -98,10 +100,12 @@ class AtlasAccumulator:
             min_confidence: texels below it are not written.
         """
         trust = self._texel_confidence(confidence)
-        pending = (self._source < 0) if self.mode == "first" else np.ones(len(self._source), dtype=bool)
+        pending = (self._source < 0) if self.rule == "first" else np.ones(len(self._source), dtype=bool)
         texel, rgb, coverage, margin = self.read(image, visible, seen, pending & (trust >= min_confidence))
         score = coverage * np.minimum(margin / SAFE_MARGIN, 1) * trust[texel]
-        better = (self.mode == "first") | (score > self._score[texel])
+        if self.rule == "median" and self.consensus is not None:
+            score = np.where(self.consensus.votes[texel] > 0, self.consensus.closeness(texel, rgb), score)
+        better = (self.rule == "first") | (score > self._score[texel])
         if self.consensus is not None:
             better &= self.consensus.agrees(texel, rgb)
         texel = texel[better]
@@ -130,12 +134,24 @@ class AtlasAccumulator:
             seen: this frame, looked at.
             reach: largest shift along each axis, pixels.
         """
+        pixels, known = self._common(seen)
+        return best_shift(image, pixels, known, reach)
+
+    def exposure(self, image: IntArray, seen: SeenFrame, mode: ExposureMatch) -> Exposure | None:
+        """What brings a frame to the exposure of the consensus, or of what was written; None where nothing has to."""
+        if mode == "off":
+            return None
+        pixels, known = self._common(seen)
+        return match_exposure(sample_image(image, pixels), known, mode)
+
+    def _common(self, seen: SeenFrame) -> tuple[FloatArray, FloatArray]:
+        """Texels in sight whose colours are known (a sample of them): pixels [K,2] and colours [K,3], 0..255."""
         known, rgb = self._source >= 0, self._rgb
         if self.consensus is not None:
             known, rgb = self.consensus.votes > 0, self.consensus.rgb
         written = np.flatnonzero(known)
         texel, pixels, _ = self._candidates(seen, written[:: 1 + len(written) // LOOKED_UP])
-        return best_shift(image, pixels, rgb[texel].astype(np.float32), reach)
+        return pixels, rgb[texel].astype(np.float32)
 
     def _texel_confidence(self, confidence: FloatArray | float) -> FloatArray:
         if np.ndim(confidence) == 0:

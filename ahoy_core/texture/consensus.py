@@ -6,7 +6,7 @@ and a fit that is off for a moment paints an arm onto the chest; both contradict
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -38,6 +38,10 @@ class Consensus:
     tolerance: float
     palette: IntArray
 
+    def scaled(self, gain: FloatArray) -> Consensus:
+        """The same at another exposure: colours times gain [3]."""
+        return replace(self, rgb=np.clip(np.rint(self.rgb * gain), 0, 255).astype(np.uint8))
+
     def agrees(self, texel: IntArray, rgb: IntArray) -> BoolArray:
         """Whether colours [K,3] uint8 of texels [K] agree with what most frames show, or nothing can tell. [K] bool."""
         own = self.votes[texel] >= LEAST_VOTES
@@ -47,6 +51,12 @@ class Consensus:
         near = self._close(rgb[~own][:, None], self.rgb[around]) & (around >= 0)
         agreeing[~own] = near.any(axis=1) | (around < 0).all(axis=1)
         return agreeing
+
+    def closeness(self, texel: IntArray, rgb: IntArray) -> FloatArray:
+        """How near colours [K,3] uint8 of texels [K] are to what most frames show: 1 the same, 0 far off."""
+        gap = np.abs(rgb.astype(np.int16) - self.rgb[texel]).sum(axis=-1)
+        nearness: FloatArray = (1 / (1 + gap)).astype(np.float32)
+        return nearness
 
     def _close(self, a: IntArray, b: IntArray) -> BoolArray:
         close: BoolArray = np.abs(a.astype(np.int16) - b).max(axis=-1) <= self.tolerance

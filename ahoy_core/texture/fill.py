@@ -1,28 +1,34 @@
-"""Role "inpaint", the simple embedded default (paper section 3.1 asks FLUX): complete the atlas on the body's surface.
+"""Completion of the atlas (paper section 3.1 asks FLUX): left/right symmetry, then harmonic filling, part by part.
 
 1. A texel that was not seen takes the colour of the point opposite it (left/right symmetry), if that one was seen.
-2. What is left is interpolated over the mesh: no part border in UV is crossed, and no seam shows. The interpolation is
-   pulled to what is likely: the back of the clothes to the front at the same place, the back of the head to its top,
-   hands and face to the skin that was seen (`ahoy_core.texture.tones`).
-3. A screened Poisson solve over the texels joins the pieces: gradients of the mirrored colours are kept, steps at
-   their border are not.
+2. What is left is interpolated over the mesh, harmonically (sparse solve), each part from itself: links between parts
+   (`ahoy_core.texture.parts`) are cut. The interpolation is pulled to what is likely: the back of the clothes to the
+   front of the same part, the back of the head to its top, hands and face to the skin that was seen; a part of which
+   nothing is known to a neutral colour (`ahoy_core.texture.tones`).
+3. A screened Poisson solve over the texels joins the pieces of a part: gradients of the mirrored colours are kept,
+   steps at their border are not.
 
-Seen texels keep their colours bit by bit.
+Seen texels keep their colours bit by bit. Skin is the one exception to "each part from itself": face and hands share
+it.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
 from ahoy_core.texture.atlas import ObservedAtlas
 from ahoy_core.texture.diffusion import Pull, solve_links, vertex_links
 from ahoy_core.texture.links import mirror_texels, texel_links
+from ahoy_core.texture.parts import find_parts
 from ahoy_core.texture.rays import BoolArray, FloatArray, IntArray
 from ahoy_core.texture.surface import Surface
 from ahoy_core.texture.texels import TexelMap, pad_charts, texel_normals
-from ahoy_core.texture.tones import likely_colours, skin_tone
+from ahoy_core.texture.tones import NEUTRAL_CLOTH, likely_colours, skin_tone
+
+FillKind = Literal["both", "harmonic", "symmetric"]
 
 # Pull of the final solve to the fill of steps 1 and 2: the step at a border is spread over about 1 / sqrt(pull) = 30
 # texels.
@@ -34,18 +40,21 @@ class FilledAtlas:
     """A complete atlas, and where its colours come from.
 
     rgb [A,A,3] uint8, charts padded. mirrored and diffused are shares of the body's surface area; the rest was seen.
-    skin is the tone used for unseen hands and face, skin_from tells whether it was "seen" or "neutral".
+    part [N] uint8 of each texel, garments the borders that the colours showed. skin is the tone used for unseen hands
+    and face, skin_from tells whether it was "seen" or "neutral".
     """
 
     rgb: IntArray
     mirrored: float
     diffused: float
+    part: IntArray
+    garments: tuple[str, ...]
     skin: tuple[int, int, int]
     skin_from: str
 
 
 def fill_atlas(
-    observed: ObservedAtlas, surface: Surface, texels: TexelMap, vertices: FloatArray, symmetry: bool = True
+    observed: ObservedAtlas, surface: Surface, texels: TexelMap, vertices: FloatArray, fill: FillKind = "both"
 ) -> FilledAtlas:
     """Complete an atlas.
 
@@ -54,7 +63,8 @@ def fill_atlas(
         surface: the body's triangles.
         texels: the atlas's texels on them.
         vertices: [V,3] the body in canonical pose, facing -y, metres.
-        symmetry: use left/right symmetry (step 1).
+        fill: "both"; "harmonic", without step 1; or "symmetric", where step 2 is one colour a part (the median of what
+            is known of it) and there is no step 3.
     """
     points = texels.points(vertices, surface.faces)
     normals = texel_normals(texels, vertices, surface)
@@ -62,16 +72,26 @@ def fill_atlas(
     colours = observed.rgb.reshape(-1, 3)[texels.flat].astype(np.float64)
     areas = texels.areas(vertices, surface)
     opposite = np.full(len(seen), -1)
-    if symmetry:
+    if fill != "harmonic":
         middle, spacing = float(vertices[:, 0].min() + vertices[:, 0].max()) / 2, float(np.sqrt(areas.mean()))
         sources, wanted = np.flatnonzero(seen), np.flatnonzero(~seen)
         opposite[wanted] = mirror_texels(points, normals, sources, wanted, middle, spacing)
     known = seen | (opposite >= 0)
     guess = np.where(seen[:, None], colours, colours[opposite])
     skin, skin_from = skin_tone(surface, texels, vertices, normals, colours, seen)
-    base = _vertex_fill(surface, texels, vertices, guess, known, skin)
-    guess[~known] = base[~known]
-    completed = _join(texels, points, normals, guess, colours, seen, known)
+    value, weight = _at_vertices(surface, texels, guess, known)
+    seen_value, seen_weight = _at_vertices(surface, texels, colours, seen)
+    parts = find_parts(surface, vertices, seen_value, seen_weight > 0)
+    part = parts.of_vertex[_nearest_vertex(surface, texels)]
+    if fill == "symmetric":
+        for number in np.unique(part):
+            own = part == number
+            guess[own & ~known] = np.median(guess[own & known], axis=0) if (own & known).any() else NEUTRAL_CLOTH
+        completed = guess
+    else:
+        base = _vertex_fill(surface, texels, vertices, value, weight, skin, parts.of_vertex)
+        guess[~known] = base[~known]
+        completed = _join(texels, points, normals, guess, colours, seen, known, part)
     rgb = np.zeros((texels.size * texels.size, 3), dtype=np.uint8)
     rgb[texels.flat] = np.clip(np.rint(completed), 0, 255).astype(np.uint8)
     total = max(float(areas.sum()), 1e-12)
@@ -79,25 +99,53 @@ def fill_atlas(
         rgb=pad_charts(rgb.reshape(texels.size, texels.size, 3), texels.chart),
         mirrored=float(areas[known & ~seen].sum()) / total,
         diffused=float(areas[~known].sum()) / total,
+        part=part.astype(np.uint8),
+        garments=parts.found,
         skin=(int(skin[0]), int(skin[1]), int(skin[2])),
         skin_from=skin_from,
     )
 
 
+def _nearest_vertex(surface: Surface, texels: TexelMap) -> IntArray:
+    """[N] the corner that each texel is nearest to."""
+    nearest: IntArray = surface.faces[texels.face, texels.bary.argmax(axis=1)]
+    return nearest
+
+
+def _at_vertices(
+    surface: Surface, texels: TexelMap, colours: FloatArray, known: BoolArray
+) -> tuple[FloatArray, FloatArray]:
+    """Mean colours [V,3] of the known texels round each vertex, and how many they are [V]."""
+    count = len(surface.limb)
+    nearest = _nearest_vertex(surface, texels)[known]
+    weight = np.bincount(nearest, minlength=count)
+    sums = [np.bincount(nearest, colours[known, channel], count) for channel in range(3)]
+    return np.stack(sums, axis=1) / np.maximum(weight, 1)[:, None], weight
+
+
 def _vertex_fill(
-    surface: Surface, texels: TexelMap, vertices: FloatArray, guess: FloatArray, known: BoolArray, skin: FloatArray
+    surface: Surface,
+    texels: TexelMap,
+    vertices: FloatArray,
+    value: FloatArray,
+    weight: FloatArray,
+    skin: FloatArray,
+    part: IntArray,
 ) -> FloatArray:
-    """Colours [N,3] of all texels, interpolated over the mesh from the known ones and what is likely."""
-    count = len(vertices)
-    nearest = surface.faces[texels.face, texels.bary.argmax(axis=1)]
-    weight = np.bincount(nearest[known], minlength=count)
-    value = np.zeros((count, 3))
-    for channel in range(3):
-        value[:, channel] = np.bincount(nearest[known], guess[known, channel], count) / np.maximum(weight, 1)
+    """Colours [N,3] of all texels, interpolated over the mesh from the known vertices and what is likely.
+
+    A triangle on a border of parts has corners of both; its texels take the colour of the nearest corner.
+    """
     pairs, weights = vertex_links(surface.faces, vertices)
-    pull = likely_colours(surface, vertices, value, weight > 0, skin)
-    value = solve_links(pairs, weights, value, weight > 0, pull, direct=True)
-    return (value[surface.faces[texels.face]] * texels.bary[:, :, None]).sum(axis=1)
+    within = part[pairs[:, 0]] == part[pairs[:, 1]]
+    pull = likely_colours(surface, vertices, value, weight > 0, skin, part)
+    value = solve_links(pairs[within], weights[within], value, weight > 0, pull, direct=True)
+    corners = surface.faces[texels.face]
+    smooth = (value[corners] * texels.bary[:, :, None]).sum(axis=1)
+    mixed = (part[corners] != part[corners][:, :1]).any(axis=1)
+    smooth[mixed] = value[_nearest_vertex(surface, texels)[mixed]]
+    filled: FloatArray = smooth
+    return filled
 
 
 def _join(
@@ -108,9 +156,11 @@ def _join(
     colours: FloatArray,
     seen: BoolArray,
     known: BoolArray,
+    part: IntArray,
 ) -> FloatArray:
     """The screened Poisson solve of step 3: colours [N,3]."""
     pairs = texel_links(texels, points, normals)
+    pairs = pairs[part[pairs[:, 0]] == part[pairs[:, 1]]]
     open_pairs = pairs[~seen[pairs].all(axis=1)]
     # Between two mirrored texels, and between two interpolated ones, the guess's own gradient; across a border of
     # kinds, none.

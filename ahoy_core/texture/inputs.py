@@ -3,41 +3,44 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from ahoy_core.body.model import BodyModel
+from ahoy_core.texture.atlas import WriteRule
+from ahoy_core.texture.exposure import ExposureMatch
+from ahoy_core.texture.fill import FillKind
 from ahoy_core.texture.rays import BoolArray, FloatArray, IntArray
 
 
 class TextureConfig(BaseModel):
     """Knobs of the texture stage.
 
-    atlas_size: texels a side. frame_stride: every n-th used frame is looked at. mode: "first" (first write wins, the
-    paper's rule) or "best" (the best view of a texel wins). grazing_cos and boundary_px: see
-    `ahoy_core.texture.surface.look`. min_frame_confidence,
-    min_joint_confidence: frames and body parts fitted worse than this write nothing. align_px: largest shift along
-    each axis, in pixels of a body 200 pixels tall, by which a frame is moved to agree with what is written (0: off).
-    outlier_levels: colours further (of 255, in any channel) from what most frames show of a texel are not written (0:
-    all are).
-    symmetry: fill from the other side of the body. canonical_height, canonical_width: pixels of the canonical views.
-    supersample: rays a pixel and axis in them.
+    atlas_size: texels a side. frame_stride: every n-th used frame is looked at. rule: "first" (first write wins, the
+    paper's), "best" (the best view of a texel wins) or "median" (the frame nearest to what most frames show wins).
+    exposure: frames are brought to one exposure by a gain a channel, by gain and gamma, or not ("off"). grazing_cos and
+    boundary_px: see `ahoy_core.texture.surface.look`. min_frame_confidence, min_joint_confidence: frames and body parts
+    fitted worse than this write nothing. align_px: largest shift along each axis, in pixels of a body 200 pixels tall,
+    by which a frame is moved to agree with what is written (0: off). outlier_levels: colours further (of 255, in any
+    channel) from what most frames show of a texel are not written (0: all are). fill: symmetry and harmonic filling
+    ("both"), or one of them alone ("symmetric", "harmonic"). canonical_height, canonical_width: pixels of the canonical
+    views. supersample: rays a pixel and axis in them.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     atlas_size: int = Field(512, ge=16, le=4096)
     frame_stride: int = Field(1, ge=1)
-    mode: Literal["first", "best"] = "first"
+    rule: WriteRule = "median"
+    exposure: ExposureMatch = "off"
     grazing_cos: float = Field(0.3, gt=0, lt=1)
     boundary_px: float = Field(2.0, ge=0)
     min_frame_confidence: float = Field(0.3, ge=0, le=1)
     min_joint_confidence: float = Field(0.0, ge=0, le=1)
     align_px: float = Field(4.0, ge=0, le=64)
     outlier_levels: float = Field(50.0, ge=0, le=255)
-    symmetry: bool = True
+    fill: FillKind = "both"
     canonical_height: int = Field(512, ge=16, le=4096)
     canonical_width: int = Field(384, ge=16, le=4096)
     supersample: int = Field(2, ge=1, le=8)

@@ -16,6 +16,13 @@ from ahoy_core.body.model import BodyModel
 from ahoy_core.conventions import CameraModel
 from ahoy_core.texture.rays import BoolArray, Caster, FloatArray, HitMap, IntArray, hit_map, to_camera
 
+# Limbs of a body's vertices, by the joint that moves them most.
+TRUNK, ARM, LEG = 0, 1, 2
+# What joints of arms and legs are called: the packaged body, the SMPL family, and plain words.
+_ARM_WORDS = ("arm", "elbow", "wrist", "finger", "metacarpal", "hand", "thumb", "index", "middle", "ring", "pinky")
+_ARM_NAMES = ("left_shoulder", "right_shoulder")
+_LEG_WORDS = ("leg", "knee", "ankle", "foot", "toe", "hip")
+
 PARTS = ("background", "body", "head", "hands", "feet")
 
 # Height in pixels of the body at which `boundary_px` is meant literally: fits err by a share of the person's size,
@@ -32,7 +39,8 @@ class Surface:
     """The body's triangles, as arrays.
 
     faces [F,3] into vertices, uvs [Vt,2] in [0,1] (origin lower left), uv_faces [F,3] into uvs, textured [F] bool
-    (False: mouth, eye sockets), part [F] uint8 into `PARTS`, hands / head [V] bool.
+    (False: mouth, eye sockets), part [F] uint8 into `PARTS`, hands / head / feet [V] bool, limb [V] uint8 (`TRUNK`,
+    `ARM` or `LEG`).
     """
 
     faces: IntArray
@@ -42,6 +50,8 @@ class Surface:
     part: IntArray
     hands: BoolArray
     head: BoolArray
+    feet: BoolArray
+    limb: IntArray
 
     @staticmethod
     def of(body: BodyModel) -> Surface:
@@ -61,7 +71,21 @@ class Surface:
             part=part,
             hands=regions.get("hands", nowhere),
             head=regions.get("head", nowhere),
+            feet=regions.get("feet", nowhere),
+            limb=_limbs(body),
         )
+
+
+def _limbs(body: BodyModel) -> IntArray:
+    """[V] the limb of each vertex."""
+    limb_of = np.zeros(body.n_joints, dtype=np.uint8)
+    for joint, name in enumerate(body.joint_names):
+        if name in _ARM_NAMES or any(word in name for word in _ARM_WORDS):
+            limb_of[joint] = ARM
+        elif any(word in name for word in _LEG_WORDS):
+            limb_of[joint] = LEG
+    limbs: IntArray = limb_of[body.lbs_weights.cpu().numpy().argmax(axis=1)]
+    return limbs
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,6 @@ import torch
 
 from ahoy_core.body.canonical import canonical_pose
 from ahoy_core.body.model import BodyModel
-from ahoy_core.body.packaged import PackagedBody
 from ahoy_core.texture.accumulate import Clip, Log, Progress, accumulate
 from ahoy_core.texture.atlas import ObservedAtlas
 from ahoy_core.texture.canonical import canonical_views
@@ -20,6 +19,12 @@ from ahoy_core.texture.inputs import TextureConfig, check_inputs, choose_frames
 from ahoy_core.texture.rays import BoolArray, FloatArray, IntArray
 from ahoy_core.texture.surface import Surface
 from ahoy_core.texture.texels import TexelMap, texel_map
+
+FILL_WORDS = {
+    "both": "left/right symmetry, then harmonic on the surface, part by part",
+    "harmonic": "harmonic on the surface, part by part",
+    "symmetric": "left/right symmetry, then one colour a part",
+}
 
 
 @dataclass(frozen=True)
@@ -74,8 +79,7 @@ def build_texture(
         body: the body model that was fitted.
         config: knobs.
         progress: called with frames done and frames in all, of both passes.
-        canonical: [V,3] the fitted shape in the canonical pose theta_*; `canonical_vertices` of the packaged body by
-            default.
+        canonical: [V,3] the fitted shape in the canonical pose theta_*; `canonical_vertices` by default.
 
     Raises:
         ValueError: where shapes disagree, or an array is missing.
@@ -88,7 +92,7 @@ def build_texture(
     points = texels.points(vertices, surface.faces)
     clip = Clip(frames, visible, fit, body, surface, config)
     observed, log = accumulate(clip, texels, points, chosen, progress)
-    filled = fill_atlas(observed, surface, texels, vertices, config.symmetry)
+    filled = fill_atlas(observed, surface, texels, vertices, config.fill)
     rendered = canonical_views(
         surface,
         texels,
@@ -118,14 +122,12 @@ def canonical_vertices(body: BodyModel, betas: FloatArray) -> FloatArray:
     """Vertices [V,3] of a shape in canonical pose with zero translation; float32, metres.
 
     Args:
-        body: the packaged body.
+        body: the packaged body or one of the SMPL family.
         betas: [S].
 
     Raises:
         ValueError: for a body that has no canonical pose.
     """
-    if not isinstance(body, PackagedBody):
-        raise ValueError(f"expected the packaged body, got {body.name!r}: pass its vertices in canonical pose")
     shape = torch.as_tensor(betas).to(body.lbs_weights)
     with torch.no_grad():
         output = body(canonical_pose(body)[None], shape[None], shape.new_zeros(1, 3))
@@ -151,11 +153,13 @@ def _notes(
         "observed_share": float(areas[seen].sum() / max(areas.sum(), 1e-12)),
         "mirrored_share": filled.mirrored,
         "diffused_share": filled.diffused,
-        "fill": "left/right symmetry, then harmonic on the surface" if config.symmetry else "harmonic on the surface",
+        "fill": FILL_WORDS[config.fill],
+        "garment_borders": list(filled.garments),
         "skin": {"rgb": list(filled.skin), "from": filled.skin_from},
-        "mode": config.mode,
+        "rule": config.rule,
         "frames_used": chosen,
         "texels_written": {str(t): count for t, count in log.written.items()},
         "frame_shifts_px": {str(t): list(shift) for t, shift in log.shifts.items() if shift != (0.0, 0.0)},
+        "frame_gains": {str(t): round(gain, 3) for t, gain in log.gains.items()},
         "frames_rejected": rejected,
     }

@@ -6,12 +6,13 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ahoy_core.texture.diffusion import Pull
-from ahoy_core.texture.rays import BoolArray, FloatArray
+from ahoy_core.texture.rays import BoolArray, FloatArray, IntArray
 from ahoy_core.texture.surface import Surface
 from ahoy_core.texture.texels import TexelMap
 
 NEUTRAL_SKIN = (198.0, 160.0, 138.0)
 NEUTRAL_CLOTH = (128.0, 128.0, 128.0)
+NEUTRAL_SHOE = (66.0, 62.0, 60.0)
 # Strength of a guess against a link between neighbours: it takes over about 1 / sqrt(pull) vertices, some 4 cm, from
 # the last colour that was seen. Weaker, and skin washes out over the shoulders and jeans over the shirt's back.
 LIKELY_PULL = 0.5
@@ -82,7 +83,7 @@ def skin_tone(
 
 
 def likely_colours(
-    surface: Surface, vertices: FloatArray, colours: FloatArray, known: BoolArray, skin: FloatArray
+    surface: Surface, vertices: FloatArray, colours: FloatArray, known: BoolArray, skin: FloatArray, part: IntArray
 ) -> Pull:
     """Guesses for a mesh's vertices, and how strongly to pull there.
 
@@ -92,16 +93,18 @@ def likely_colours(
         colours: [V,3] in 0..255, of the known vertices.
         known: [V] bool.
         skin: [3] the skin's tone.
+        part: [V] parts; a part is guessed from itself, one of which nothing is known gets a neutral colour.
     """
     target = np.tile(np.array(NEUTRAL_CLOTH), (len(vertices), 1))
     strength = np.zeros(len(vertices))
-    cloth = ~surface.hands & ~surface.head
-    if (known & cloth).any():
-        near, front = _front_for_back(vertices, colours, known & cloth, ~known & cloth)
-        target[near], strength[near] = front, LIKELY_PULL
-    else:
-        # A body in skin's colour all over would be the wrong guess.
-        strength[cloth] = LIKELY_PULL
+    target[surface.feet] = NEUTRAL_SHOE
+    for number in np.unique(part[~surface.hands & ~surface.head]):
+        own = (part == number) & ~surface.hands & ~surface.head
+        if (known & own).any():
+            near, front = _front_for_back(vertices, colours, known & own, ~known & own)
+            target[near], strength[near] = front, LIKELY_PULL
+        else:
+            strength[own] = LIKELY_PULL
     normals = vertex_normals(surface, vertices)
     share = _head_share(vertices, vertices[surface.head][:, 2])
     top = surface.head & known & (share > TOP_OF_HEAD)

@@ -14,14 +14,18 @@ from ahoy_core.body.convert import (
     Skeleton,
     SkeletonPose,
     body_skeleton,
+    convert_body_pose,
     convert_pose,
     from_local_ref,
+    joint_map,
     rig_skeleton,
     skeleton_joints,
     to_local_ref,
 )
+from ahoy_core.body.lbs import global_rotations
+from ahoy_core.body.model import BodyModel
 from ahoy_core.body.packaged import PackagedBody, load_packaged_body
-from ahoy_core.body.rotations import axis_angle_to_matrix, so3_exp
+from ahoy_core.body.rotations import axis_angle_to_matrix, geodesic_distance, matrix_to_axis_angle, so3_exp
 
 GOLDEN = Path(__file__).with_name("golden_captures.npz")
 MILLIMETRE = 1e-3
@@ -129,3 +133,101 @@ def test_translated_bones_and_other_rigs_are_refused(body: PackagedBody) -> None
         from_local_ref(body, pose, body.default_betas)
     with pytest.raises(ValueError, match=r"\[T,163,4,4\]"):
         from_local_ref(body, pose[:, :104], body.default_betas)
+
+
+def body_pose(body: BodyModel, count: int, seed: int = 0) -> tuple[Tensor, Tensor]:
+    rng = torch.Generator().manual_seed(seed)
+    pose = 0.4 * torch.randn(count, body.n_joints, 3, generator=rng, dtype=torch.float64)
+    return pose, torch.randn(count, 3, generator=rng, dtype=torch.float64)
+
+
+def paired(there: BodyModel, here: BodyModel) -> list[int]:
+    """Joints of `here` whose rotation survives a trip to `there` and back."""
+    to, back = joint_map(there.joint_names, here.joint_names), joint_map(here.joint_names, there.joint_names)
+    assert to is not None and back is not None
+    return [j for j, name in enumerate(here.joint_names) if to.get(back.get(name, "")) == name or j == 0]
+
+
+@pytest.mark.parametrize(
+    ("here", "there"),
+    [("smplx", "packaged"), ("smpl", "packaged"), ("smplh", "packaged"), ("smpl", "smplx"), ("smplh", "smplx")],
+)
+def test_poses_survive_the_trip_to_another_body_and_back(bodies64: dict[str, BodyModel], here: str, there: str) -> None:
+    source, target = bodies64[here], bodies64[there]
+    pose, transl = body_pose(source, 3)
+    kept = paired(target, source)
+    assert {source.joint_names[j] for j in range(22)} <= {source.joint_names[j] for j in kept}, "all of the body's 22"
+    still = torch.ones(source.n_joints, dtype=torch.bool)
+    still[kept] = False
+    pose[:, still] = 0
+    back, back_transl = convert_body_pose(target, source, *convert_body_pose(source, target, pose, transl))
+    torch.testing.assert_close(axis_angle_to_matrix(back), axis_angle_to_matrix(pose), atol=1e-9, rtol=0)
+    torch.testing.assert_close(back_transl, transl, atol=1e-12, rtol=0)
+
+
+@pytest.mark.parametrize("there", ["smpl", "smplh", "smplx"])
+def test_a_turn_of_the_whole_body_turns_the_converted_one_alike(bodies64: dict[str, BodyModel], there: str) -> None:
+    """Through a full turn: axis-angle ends where it began, the rotation does not stutter on the way."""
+    source, target = bodies64["packaged"], bodies64[there]
+    pose, transl = body_pose(source, 1)
+    angles = torch.linspace(0, 2 * torch.pi, 9, dtype=torch.float64)
+    turns = axis_angle_to_matrix(torch.stack([0 * angles, 0 * angles, angles], dim=-1))
+    turned = pose.expand(9, -1, -1).clone()
+    turned[:, 0] = matrix_to_axis_angle(turns @ axis_angle_to_matrix(pose[:, 0]))
+    got, place = convert_body_pose(source, target, turned, transl.expand(9, -1))
+    still, _ = convert_body_pose(source, target, pose, transl)
+    torch.testing.assert_close(axis_angle_to_matrix(got[:, 0]), turns @ axis_angle_to_matrix(still[:, 0]))
+    others = axis_angle_to_matrix(got[:, 1:])
+    torch.testing.assert_close(others, others[:1].expand_as(others), atol=1e-9, rtol=0)
+    output, before = (
+        target(got, target.default_betas[None], place),
+        target(still, target.default_betas[None], place[:1]),
+    )
+    local, expected = (o.vertices - o.joints[:, :1] for o in (output, before))
+    torch.testing.assert_close(local, expected @ turns.mT, atol=1e-9, rtol=0)
+
+
+@pytest.mark.parametrize("there", ["smpl", "smplh", "smplx"])
+def test_limbs_point_the_same_way_though_one_body_rests_with_raised_arms(
+    bodies64: dict[str, BodyModel], there: str
+) -> None:
+    source, target = bodies64["packaged"], bodies64[there]
+    pose, transl = body_pose(source, 4)
+    for bone in ("upperleg02", "lowerleg02", "upperarm02", "lowerarm02", "shoulder01"):  # twist bones have no partner
+        for side in "LR":
+            pose[:, source.joint_names.index(f"{bone}.{side}")] = 0
+    posed = source(pose, source.default_betas[None], transl).joints
+    got = target(*_with_betas(target, convert_body_pose(source, target, pose, transl))).joints
+    for side, letter in (("left", "L"), ("right", "R")):
+        for (a, b), (c, d) in {
+            ("upperarm01", "lowerarm01"): ("shoulder", "elbow"),
+            ("lowerarm01", "wrist"): ("elbow", "wrist"),
+            ("upperleg01", "lowerleg01"): ("hip", "knee"),
+            ("lowerleg01", "foot"): ("knee", "ankle"),
+        }.items():
+            bone = (
+                posed[:, source.joint_names.index(f"{b}.{letter}")]
+                - posed[:, source.joint_names.index(f"{a}.{letter}")]
+            )
+            limb = got[:, target.joint_names.index(f"{side}_{d}")] - got[:, target.joint_names.index(f"{side}_{c}")]
+            cosine = torch.nn.functional.cosine_similarity(bone, limb, dim=-1)
+            torch.testing.assert_close(cosine, torch.ones_like(cosine), atol=1e-9, rtol=0)
+
+
+def _with_betas(body: BodyModel, posed: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+    return posed[0], body.default_betas[None], posed[1]
+
+
+def test_the_trunk_and_the_feet_rest_as_they_do_and_hands_follow_the_forearm(bodies64: dict[str, BodyModel]) -> None:
+    """The packaged body at rest (A-pose) is the SMPL-X body with its arms lowered, and nothing else turned."""
+    source, target = bodies64["packaged"], bodies64["smplx"]
+    zero = torch.zeros(1, source.n_joints, 3, dtype=torch.float64)
+    pose, _ = convert_body_pose(source, target, zero, zero[:, 0])
+    world = global_rotations(axis_angle_to_matrix(pose), target.parents)[0]
+    eye = torch.eye(3, dtype=torch.float64)
+    for name in ("pelvis", "spine1", "spine3", "head", "left_ankle", "right_foot", "left_collar"):
+        torch.testing.assert_close(world[target.joint_names.index(name)], eye, atol=1e-9, rtol=0)
+    arm, hand, finger = (world[target.joint_names.index(f"left_{part}")] for part in ("elbow", "wrist", "index3"))
+    assert geodesic_distance(arm, eye) > 0.3
+    torch.testing.assert_close(hand, arm, atol=1e-9, rtol=0)
+    assert geodesic_distance(finger, eye) > 0.3

@@ -5,20 +5,16 @@ from __future__ import annotations
 import math
 from importlib import resources
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
-from ahoy_core.body.keypoints import keypoints
-from ahoy_core.body.lbs import lbs
 from ahoy_core.body.model import BodyModel
 from ahoy_core.body.packaged import PackagedBody, load_packaged_body
 from ahoy_core.body.phenotype import ANCHOR_COUNTS, corner_weights
 from ahoy_core.body.regions import faces_within
-from ahoy_core.body.rotations import axis_angle_to_matrix
 
 GOLDEN = Path(__file__).with_name("golden_anny.npz")
 TENTH_OF_A_MILLIMETRE = 1e-4
@@ -94,66 +90,6 @@ def test_all_vertices_are_the_live_librarys_over_random_draws_and_all_corner_sha
     assert (rest - corners).norm(dim=-1).max() < TENTH_OF_A_MILLIMETRE
 
 
-def test_skin_weights_are_convex(body: PackagedBody) -> None:
-    torch.testing.assert_close(body.lbs_weights.sum(1), torch.ones(body.n_vertices))
-    assert (body.lbs_weights >= 0).all()
-
-
-def test_zero_pose_is_the_rest_body(body64: PackagedBody) -> None:
-    betas, expression = (x[:1] for x in random_input(body64, 1)[1::2])
-    zero = torch.zeros(1, body64.n_joints, 3, dtype=torch.float64)
-    output = body64(zero, betas, zero[:, 0], expression)
-    torch.testing.assert_close(output.vertices, output.rest_vertices, atol=1e-14, rtol=0)
-    torch.testing.assert_close(output.joints, output.rest_joints, atol=1e-14, rtol=0)
-
-
-def test_transl_moves_everything_and_nothing_else(body64: PackagedBody) -> None:
-    pose, betas, transl, expression = random_input(body64, 2)
-    here = body64(pose, betas, torch.zeros_like(transl), expression)
-    there = body64(pose, betas, transl, expression)
-    torch.testing.assert_close(there.vertices - transl[:, None], here.vertices)
-    torch.testing.assert_close(there.joints - transl[:, None], here.joints)
-
-
-def test_a_full_turn_of_the_root_leaves_the_local_shape_identical(body64: PackagedBody) -> None:
-    pose, betas, transl, expression = random_input(body64, 1)
-    angles = torch.linspace(0, 2 * math.pi, 9, dtype=torch.float64)
-    turned = pose.expand(9, -1, -1).clone()
-    turned[:, 0] = torch.stack([0 * angles, 0 * angles, angles], dim=-1)
-    output = body64(turned, betas, transl.expand(9, -1), expression)
-    root = axis_angle_to_matrix(turned[:, 0])
-    local = (output.vertices - output.joints[:, :1]) @ root
-    torch.testing.assert_close(local, local[:1].expand_as(local), atol=1e-9, rtol=0)
-    torch.testing.assert_close(output.vertices[-1], output.vertices[0], atol=1e-9, rtol=0)
-
-
-def test_transforms_are_what_skinning_blends(body64: PackagedBody) -> None:
-    output = body64(*random_input(body64, 2))
-    torch.testing.assert_close(lbs(output.rest_vertices, body64.lbs_weights, output.transforms), output.vertices)
-
-
-def test_one_shape_serves_many_poses(body: PackagedBody) -> None:
-    pose, betas, transl, expression = random_input(body, 3)
-    shared = body(pose, betas[:1], transl, expression[:1])
-    repeated = body(pose, betas[:1].expand(3, -1), transl, expression[:1].expand(3, -1))
-    torch.testing.assert_close(shared.vertices, repeated.vertices, atol=1e-5, rtol=0)
-    assert shared.rest_vertices.shape == shared.vertices.shape
-
-
-def test_gradients_pass_gradcheck_through_pose_shape_translation_and_expression(body64: PackagedBody) -> None:
-    few = body64.subset(torch.arange(0, body64.n_vertices, 4000))
-    pose, betas, transl, expression = random_input(few, 1)
-    pose[:, 5:60] = 0
-    inputs = tuple(x.requires_grad_() for x in (pose, 0.05 + 0.4 * betas, transl, expression))
-    weights = torch.randn(len(few.lbs_weights), 3, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
-
-    def scalar(*given: Tensor) -> Tensor:
-        output = few(*given)
-        return (output.vertices * weights).sum() + output.joints.square().sum()
-
-    assert torch.autograd.gradcheck(scalar, inputs)
-
-
 @pytest.mark.parametrize("value", [0.0, 1 / 3, 0.5, 2 / 3, 1.0])
 def test_every_phenotype_has_a_finite_live_gradient_at_anchors(body: PackagedBody, value: float) -> None:
     betas = torch.full((1, 6), value)
@@ -184,13 +120,6 @@ def test_adult_is_upright_faces_minus_y_and_has_the_left_hand_at_plus_x(body: Pa
     assert joint["wrist.L"][0] > 0.2
     assert joint["toe1-1.L"][1] < joint["foot.L"][1] - 0.05
     assert vertices[0, body.regions["eyes"], 1].max() < joint["head"][1]
-
-
-def test_triangles_face_outwards(body: PackagedBody) -> None:
-    vertices = body.shape(body.default_betas[None])[0][0]
-    a, b, c = vertices[body.faces].unbind(1)
-    volume = (a * torch.linalg.cross(b, c)).sum() / 6
-    assert 0.03 < float(volume) < 0.15, "cubic metres, positive for counter-clockwise from outside"
 
 
 def test_texture_coordinates_fill_the_unit_square_without_degenerate_charts(body: PackagedBody) -> None:
@@ -231,49 +160,3 @@ def test_expressions_move_the_face_only(body: PackagedBody) -> None:
     moved = (every - neutral).norm(dim=-1)
     assert (moved.amax(1) > 5e-4).all(), "each action does something"
     assert moved[:, body.regions["feet"] | body.regions["hands"]].max() < 1e-6, "round-off only"
-
-
-def test_a_subset_is_the_body_at_its_vertices(body: PackagedBody) -> None:
-    given = random_input(body, 2)
-    whole = body(*given)
-    indices = torch.cat([body.landmark_indices.unique(), torch.arange(0, body.n_vertices, 50)]).unique()
-    part = body.subset(indices)
-    output = part(*given)
-    torch.testing.assert_close(output.vertices, whole.vertices[:, indices], atol=1e-5, rtol=0)
-    torch.testing.assert_close(keypoints(part, output), keypoints(body, whole), atol=1e-5, rtol=0)
-    torch.testing.assert_close(indices[part.faces], body.faces[faces_within(body.faces, part_mask(body, indices))])
-
-
-def part_mask(body: PackagedBody, indices: Tensor) -> Tensor:
-    mask = torch.zeros(body.n_vertices, dtype=torch.bool)
-    mask[indices] = True
-    return mask
-
-
-def test_landmarks_of_a_subset_without_them_are_refused(body: PackagedBody) -> None:
-    part = body.subset(torch.arange(10))
-    with pytest.raises(ValueError, match="landmark vertices"):
-        keypoints(part, part(*random_input(part, 1)))
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"pose": torch.zeros(1, 55, 3)}, "convert_pose"),
-        ({"betas": torch.zeros(1, 10)}, r"betas \[B,6\]"),
-        ({"betas": torch.zeros(6)}, r"betas \[B,6\]"),
-        ({"betas": torch.zeros(3, 6)}, "as many expressions as betas"),
-        ({"betas": torch.zeros(3, 6), "expression": None}, "one shape or 2"),
-        ({"transl": torch.zeros(1, 3)}, r"transl \[2,3\]"),
-        ({"expression": torch.zeros(2, 10)}, r"expression \[B,52\]"),
-    ],
-)
-def test_wrong_sizes_are_refused_by_name(body: PackagedBody, change: dict[str, Tensor | None], message: str) -> None:
-    given: dict[str, Any] = dict(zip(("pose", "betas", "transl", "expression"), random_input(body, 2), strict=True))
-    with pytest.raises(ValueError, match=message):
-        body(**{**given, **change})
-
-
-def test_half_precision_is_refused() -> None:
-    with pytest.raises(ValueError, match="float32 or float64"):
-        load_packaged_body(dtype=torch.float16)

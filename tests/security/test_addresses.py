@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ipaddress
 import socket
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,7 +11,7 @@ import pytest
 
 from tasks.errors import MissingSourceError, RefusedSourceError, TransientError, is_transient
 from tasks.sources import SourcePolicy, fetch_source
-from tasks.sources.address import connect, resolve
+from tasks.sources.address import connect, refusal, resolve
 from tests.sources.server import Served, serving
 
 NOWHERE = "203.0.113.7"  # reserved for documentation, so "not public" for the check
@@ -60,13 +61,16 @@ def test_a_name_that_leads_inside_is_refused(names: Names, cache: Path, address:
         resolve("innocent.example", 80, SourcePolicy())
 
 
-def test_rebinding_does_not_slip_through(names: Names, server: Served, clip: bytes, cache: Path) -> None:
-    """The first answer is public, every later one is the loopback interface; whoever looks twice connects inside."""
+def test_rebinding_does_not_slip_through(
+    names: Names, server: Served, clip: bytes, cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first answer counts as public, every later one is this machine; whoever looks twice connects inside."""
+    public = ipaddress.ip_address("127.0.0.2")  # nobody listens there on this port, and no test talks to real strangers
+    monkeypatch.setattr("tasks.sources.address.refusal", lambda a: None if a == public else refusal(a))
     server.file("/a.mp4", clip)
-    names.answers["rebind.example"] = [[PUBLIC], ["127.0.0.1"]]
-    policy = SourcePolicy(attempts=1, connect_timeout_s=0.2)
+    names.answers["rebind.example"] = [[str(public)], ["127.0.0.1"]]
     with pytest.raises(TransientError):
-        fetch_source(f"http://rebind.example:{server.port}/a.mp4", policy, cache)
+        fetch_source(f"http://rebind.example:{server.port}/a.mp4", SourcePolicy(attempts=1), cache)
     assert server.requests == [] and names.asked == ["rebind.example"]
 
 

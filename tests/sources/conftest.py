@@ -29,7 +29,7 @@ def server() -> Iterator[Served]:
 @pytest.fixture
 def policy() -> SourcePolicy:
     return SourcePolicy(
-        private_hosts=("127.0.0.1",), attempts=3, backoff_s=0.001, connect_timeout_s=2.0, read_timeout_s=0.5
+        private_hosts=("127.0.0.1",), attempts=3, backoff_s=0.001, connect_timeout_s=20.0, read_timeout_s=20.0
     )
 
 

@@ -20,11 +20,11 @@ def accumulate(
     frames: np.ndarray,
     masks: np.ndarray,
     order: list[int] | None = None,
-    mode: str = "first",
+    rule: str = "first",
     boundary_px: float = 2.0,
 ) -> ObservedAtlas:
     surface = Surface.of(body)
-    atlas = AtlasAccumulator(surface, texels, mode)
+    atlas = AtlasAccumulator(surface, texels, rule)
     for t in range(len(frames)) if order is None else order:
         posed = body(*(torch.as_tensor(a)[None] for a in (fit["pose"][t], fit["betas"], fit["transl"][t]))).vertices[0]
         seen = look(surface, posed.numpy(), fit["viewmat"], fit["K"], masks[t], boundary_px=boundary_px)
@@ -96,8 +96,8 @@ def test_best_view_takes_the_squarest_look_at_each_texel_in_any_order(body: Caps
     fit = turning(4)
     frames, masks = pictures(body, fit, smooth_paint)
     # Boundary 0 makes every margin safe, so that angle alone ranks the views.
-    best = accumulate(body, texels, fit, frames, masks, mode="best", boundary_px=0)
-    shuffled = accumulate(body, texels, fit, frames, masks, order=[2, 0, 3, 1], mode="best", boundary_px=0)
+    best = accumulate(body, texels, fit, frames, masks, rule="best", boundary_px=0)
+    shuffled = accumulate(body, texels, fit, frames, masks, order=[2, 0, 3, 1], rule="best", boundary_px=0)
     first = accumulate(body, texels, fit, frames, masks, boundary_px=0)
     np.testing.assert_array_equal(best.rgb, shuffled.rgb)
     assert (best.coverage >= first.coverage - 1e-6).all()

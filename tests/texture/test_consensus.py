@@ -9,7 +9,7 @@ from ahoy_core.texture.consensus import Votes
 from ahoy_core.texture.inputs import TextureConfig
 from ahoy_core.texture.texture import build_texture
 
-from .synthetic import CapsuleBody, pictures, standing
+from .synthetic import CapsuleBody, pictures, smooth_paint, standing
 
 
 @pytest.mark.parametrize("when", [0, 2, 4])
@@ -17,7 +17,7 @@ def test_a_ball_that_the_mask_took_for_the_person_leaves_no_colour(body: Capsule
     fit = standing(5)
     frames, masks = pictures(body, fit, lambda points: np.full((len(points), 3), 60.0))
     frames[when, 50:70, 56:72] = 255
-    config = TextureConfig(atlas_size=64, canonical_height=32, canonical_width=24, align_px=0)
+    config = TextureConfig(atlas_size=64, canonical_height=32, canonical_width=24, align_px=0, rule="first")
     clean, naive = (
         build_texture(
             frames,
@@ -52,3 +52,24 @@ def test_a_colour_is_refused_by_a_majority_or_where_nothing_near_looks_like_it()
     consensus = votes.consensus(points, 40.0)
     assert consensus.agrees(np.arange(3), far).tolist() == [False, False, True]
     assert consensus.agrees(np.arange(3), near).tolist() == [True, True, True]
+
+
+def test_the_median_rule_takes_the_frame_nearest_to_what_most_show(body: CapsuleBody) -> None:
+    """A shadow that passes over the person, in the first frame above all, is in no texel that three frames show."""
+    fit = standing(5)
+    frames, masks = pictures(body, fit, smooth_paint)
+    shaded = frames.copy()
+    shaded[0] = (0.8 * shaded[0]).astype(np.uint8)
+    shaded[3, :64] = (0.85 * shaded[3, :64]).astype(np.uint8)
+    errors = {}
+    for rule in ("first", "median"):
+        config = TextureConfig(
+            atlas_size=64, canonical_height=32, canonical_width=24, align_px=0, rule=rule, exposure="off"
+        )
+        made = build_texture(shaded, masks, fit, body, config, canonical=body.rest.numpy())
+        clean = build_texture(frames, masks, fit, body, config, canonical=body.rest.numpy())
+        assert set(np.unique(made.source_frame)) <= set(range(-1, 5))
+        seen = made.coverage > 0
+        errors[rule] = np.abs(made.observed_rgb[seen].astype(float) - clean.observed_rgb[seen]).mean()
+    assert errors["first"] > 10
+    assert errors["median"] == 0

@@ -1,0 +1,49 @@
+"""The roles that models fill, as protocols, and one explicit table of who can fill them.
+
+Contracts: float32, RGB in [0,1], metres, OpenCV cameras. Nothing registers itself; a new filling is one entry here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any, Final, Protocol
+
+from torch import Tensor
+
+from ahoy_core.body.packaged import load_packaged_body
+from ahoy_core.body.smpl_load import load_smpl
+from ahoy_core.texture.fill import fill_atlas
+from ahoy_core.texture.fillings import TexturedBody
+from ahoy_core.texture.selfcheck import Completion
+
+
+class Inpaint(Protocol):
+    """Role "inpaint" (the paper: FLUX Fill)."""
+
+    def __call__(self, image: Tensor, mask: Tensor, prompt: str = "", seed: int = 0) -> Tensor:
+        """Image [3,H,W] and mask [1,H,W] (1 = fill) -> image [3,H,W]."""
+        ...
+
+
+class Views(Protocol):
+    """Role "views" (the paper: SyncHuman)."""
+
+    def __call__(self, image: Tensor, mask: Tensor) -> tuple[Tensor, tuple[float, ...]]:
+        """Canonical image [3,H,W] and mask [1,H,W] -> views [4,3,H,W] and their azimuths in degrees."""
+        ...
+
+
+COMPLETIONS: Final[Mapping[str, Completion]] = {
+    "symmetry + harmonic": partial(fill_atlas, fill="both"),
+    "harmonic": partial(fill_atlas, fill="harmonic"),
+    "symmetry": partial(fill_atlas, fill="symmetric"),
+}
+"""Fillings of the atlas, for `ahoy_core.texture.selfcheck.score_fillings`."""
+
+FILLINGS: Final[Mapping[str, Mapping[str, Callable[..., Any]]]] = {
+    "body": {"packaged": load_packaged_body, "smpl": load_smpl},
+    "inpaint": {"textured body": TexturedBody.inpaint},
+    "views": {"textured body": TexturedBody.views},
+}
+"""Role -> name -> what fills it: loaders of bodies, methods of a person's `TexturedBody`."""
