@@ -26,6 +26,14 @@ class CorruptError(StoreError):
     """Bytes in the store are not those that were committed."""
 
 
+class UnknownBatchError(StoreError):
+    """The store has no batch of that name."""
+
+
+class BatchExistsError(StoreError):
+    """A batch of that name is there already, made from another list; the message says what differs."""
+
+
 class ArtifactError(ValueError):
     """A folder does not hold what its stage declares, or a name is not allowed in the store."""
 

@@ -23,6 +23,7 @@ from storage_schema.errors import CorruptError, StoreError
 from storage_schema.keys import canonical_json
 from storage_schema.manifest import check_name
 from storage_schema.schemas import TABLES, TableSchema
+from storage_schema.secrets import redact, redact_json
 from storage_schema.store import ArtifactStore
 
 __all__ = ["TABLES", "TableSchema", "Tables"]
@@ -81,7 +82,9 @@ class Tables:
         self._backend.write(path, _to_parquet(schema, data, [name]))
         return path
 
-    def read(self, table: str, batch: str | None = None, filters: Any = None) -> pa.Table:
+    def read(
+        self, table: str, batch: str | None = None, filters: Any = None, columns: Sequence[str] | None = None
+    ) -> pa.Table:
         """All rows, with the current columns and `batch` as the first.
 
         Args:
@@ -89,6 +92,7 @@ class Tables:
             batch: only this one; None for all.
             filters: what `pyarrow.parquet.read_table` takes: an expression, or tuples such as ("stage", "==",
                 "ingest").
+            columns: only these, in this order; filters may name others.
 
         Returns:
             The rows, files in the order in which they were written.
@@ -105,10 +109,11 @@ class Tables:
             for part in self._parts(schema, name):
                 tables.append(_with_batch(part.rows, name))
         rows = pa.concat_tables(tables)
-        if filters is None:
-            return rows
-        expression = filters if isinstance(filters, pa.compute.Expression) else pq.filters_to_expression(filters)
-        return rows.filter(expression)
+        if filters is not None:
+            rows = rows.filter(
+                filters if isinstance(filters, pa.compute.Expression) else pq.filters_to_expression(filters)
+            )
+        return rows if columns is None else rows.select(list(columns))
 
     def batches(self, table: str) -> list[str]:
         """Names of the batches that have rows in a table, sorted."""
@@ -226,7 +231,9 @@ def _value(schema: TableSchema, column: pa.Field, value: Any, where: str) -> Any
     if choices is not None and value not in choices:
         raise ValueError(f"{where}: expected one of {choices}, got {value!r}")
     if column.name in schema.json:
-        return canonical_json(value, where).decode("utf-8")
+        return canonical_json(redact_json(value), where).decode("utf-8")
+    if column.name in schema.redacted and isinstance(value, str):
+        return redact(value)
     if pa.types.is_timestamp(column.type):
         return _time(value, where)
     if pa.types.is_list(column.type) or pa.types.is_fixed_size_list(column.type):

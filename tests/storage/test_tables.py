@@ -18,7 +18,19 @@ from storage_schema.tables import Tables, _to_parquet
 
 NOW = datetime(2026, 1, 2, 3, 4, 5, 678901, tzinfo=UTC)
 REQUIRED: dict[str, dict[str, Any]] = {
+    "videos": {"video_id": "v", "source": "https://host/v.mp4"},
+    "attempts": {"video_id": "v", "run_id": "r", "attempt_number": 1, "seq": 0, "state": "running", "at": NOW},
+    "effects": {
+        "video_id": "v",
+        "key": "k",
+        "scene": "s",
+        "effect": "shadow",
+        "enabled": False,
+        "reason": "no ground in the scene",
+    },
     "stages": {
+        "attempt_number": 2,
+        "seq": 7,
         "video_id": "v",
         "run_id": "r",
         "stage": "ingest",
@@ -41,6 +53,26 @@ REQUIRED: dict[str, dict[str, Any]] = {
     },
 }
 OPTIONAL: dict[str, dict[str, Any]] = {
+    "videos": {
+        "content_hash": "h",
+        "title": "<b>walk</b>",
+        "duration_s": 4.5,
+        "fps": 29.97,
+        "width": 640,
+        "height": 360,
+        "frames": 135,
+        "options": {"subject": 1},
+    },
+    "attempts": {
+        "stage": "coarse",
+        "flow_run_id": "f",
+        "worker": "host:12",
+        "error_class": "OSError",
+        "error_message": "gone",
+        "wall_s": 2.5,
+        "cpu_s": 1.5,
+    },
+    "effects": {"predicted_s": 0.5, "measured_s": 0.25},
     "stages": {
         "attempt": "a",
         "key": "k",
@@ -64,6 +96,7 @@ OPTIONAL: dict[str, dict[str, Any]] = {
 STORED = {
     "knobs": '{"a":[1,null],"b":0.1}',
     "accuracy": '{"px":3.5}',
+    "options": '{"subject":1}',
     "pose": [0, 1, 2, 3, 4, 5],
     "transl": [0, 1, 2],
     "K": [1, 0, 0, 0, 1, 0, 0, 0, 1],
@@ -252,6 +285,28 @@ def test_rows_of_older_versions_are_upgraded_step_by_step_when_read_and_when_com
     assert current.read("toy").to_pylist() == expected
     assert current.compact("toy", "b") == 3
     assert current.read("toy").to_pylist() == expected
+
+
+def test_stages_of_version_1_get_an_order_and_keep_everything_else(store: ArtifactStore) -> None:
+    now = TABLES["stages"]
+    columns = pa.schema([column for column in now.columns if column.name not in ("attempt_number", "seq")])
+    v1 = {"stages": TableSchema("stages", 1, columns, choices=now.choices, json=now.json)}
+    row = {name: value for name, value in REQUIRED["stages"].items() if name in columns.names}
+    Tables(store, v1).append("stages", [row, {**row, "stage": "perceive"}], batch="b")
+    first, second = Tables(store).read("stages", "b").to_pylist()
+    assert first == {"batch": "b", **dict.fromkeys(now.columns.names), **row, "attempt_number": 1, "seq": 0}
+    assert second["stage"] == "perceive"
+
+
+def test_secrets_are_taken_out_of_rows_as_they_are_written(tables: Tables) -> None:
+    secret = "hunter2hunter2"
+    url = f"https://me:{secret}@host/v.mp4?v=1&X-Amz-Signature={secret}"
+    tables.append("videos", [{"video_id": "v", "source": url, "options": {"password": secret, "u": url}}], batch="b")
+    failed = {"state": "failed", "error_message": f"403 for {url}", "knobs": {"note": url, "token": "[v]"}}
+    tables.append("stages", [{**REQUIRED["stages"], **failed}], batch="b")
+    rows = tables.read("videos").to_pylist() + tables.read("stages").to_pylist()
+    assert secret not in str(rows)
+    assert "host/v.mp4?v=1" in rows[0]["source"] and "[v]" in rows[1]["knobs"], "what is no secret stays"
 
 
 def test_rows_of_a_newer_version_are_refused_with_what_to_do_and_left_alone(store: ArtifactStore) -> None:
