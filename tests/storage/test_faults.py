@@ -104,7 +104,7 @@ def test_a_kill_between_any_two_steps_of_an_append_or_a_compaction_loses_and_dou
         assert frames in ([0, 1, 2], [0, 1, 2, 3, 4])
         tables.compact("frames", "b")
         assert tables.read("frames", "b")["frame"].to_pylist() == frames
-        assert len(tables._backend.names("tables/frames/batch=b")) == 1
+        assert len(tables._partition("frames", "b").snapshot().parts) == 1
         if code == DONE:
             assert step >= 8
             return
