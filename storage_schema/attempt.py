@@ -129,10 +129,10 @@ class Attempt:
         backend = self._store.backend
         path = f"{self._store.attempt_folder(self.stage, self.key, self.name)}/{name}"
         size = (self.dir / name).stat().st_size
-        backend.put(self.dir / name, path)
+        digest = backend.put(self.dir / name, path)
         if backend.size(path) != size:
             raise StoreError(f"{path} has {backend.size(path)} bytes in the store, {size} were written; run again")
-        return BlobRef(name, path, size, backend.sha256(path))
+        return BlobRef(name, path, size, digest)
 
     def _discard(self, *, published: bool) -> None:
         """Delete what the attempt left. A failure costs space, never correctness: `ArtifactStore.gc` finds it later."""

@@ -188,6 +188,18 @@ class Partition:
         # The answer to our own write may be lost on the way; a client that asks again is told that the file is there.
         return self.backend.create(path, data) or self.backend.read(path) == data
 
+    def orphans(self) -> list[str]:
+        """Merged files that are not in force: of a merge that was killed or lost; or one that is about to publish."""
+        for _ in range(_READ_TRIES):
+            try:
+                # Listed before the index is read, so that one that is published meanwhile is seen.
+                names = self._listing(f"{self.folder}/merged")
+                live = {entry.name for entry in self.index().merged}
+            except FileNotFoundError:
+                continue
+            return [self.merged_path(name) for name in names if name not in live]
+        raise StoreError(f"{self.folder} kept changing while it was read; try again once nobody merges it")
+
     def merged_path(self, name: str) -> str:
         """Where a merged file lies, relative to the root of the store."""
         return f"{self.folder}/merged/{name}"

@@ -19,7 +19,7 @@ import pytest
 from fsspec import register_implementation
 from fsspec.implementations.memory import MemoryFileSystem
 
-from storage_schema.errors import StoreFullError, is_full
+from storage_schema.errors import StoreFullError, StoreUnavailableError, is_full
 from storage_schema.store import ArtifactStore
 from storage_schema.tables import Tables
 
@@ -195,7 +195,7 @@ def test_a_connection_that_breaks_at_any_step_leaves_nothing_or_everything(tmp_p
         try:
             commit(store, 1.0)
             broke = Failing.left < 0
-        except ConnectionError:
+        except StoreUnavailableError:
             broke = True
         finally:
             Failing.left = None
