@@ -2,7 +2,8 @@
 
 The batch is synthetic, its rows written one by one as runs write them (`storage_schema.tables.Tables.append`, by
 `--writers` processes side by side): per video a row when it is scheduled, when it starts and when it ends, and one per
-stage; one video in twenty fails in some stage and is tried again. Then `status` runs `--repeats` times in a fresh
+stage; one attempt in twenty fails in some stage and is tried again (`--together` writes a video's rows of one table in
+one append, to save time where only the reading is asked for). Then `status` runs `--repeats` times in a fresh
 process each, on one core: `status_s` is its wall time with the interpreter's start and all imports, `status_cpu_s` its
 CPU time. `files` and `bytes` are what it found in the store.
 """
@@ -33,6 +34,8 @@ BATCH = "synthetic"
 STAGES = ("ingest", "perceive", "texture", "coarse", "animate", "report")
 MEAN_S = {"ingest": 2.0, "perceive": 21.0, "texture": 9.0, "coarse": 33.0, "animate": 12.0, "report": 1.0}
 FAIL_RATE = 0.05  # of attempts
+ERROR = {"error_class": "ValueError", "error_message": "expected a person in some frame, got none"}
+Row = dict[str, Any]
 STATUS = """
 import sys
 from storage_schema.status import batch_status
@@ -44,43 +47,47 @@ print(status.total, status.videos["done"])
 """
 
 
-def write_batch(url: str, videos: int, writers: int = 2) -> None:
+def write_batch(url: str, videos: int, writers: int = 2, together: bool = False) -> None:
     """Submit a batch of `videos` and write the rows of all its runs."""
     store = ArtifactStore(url, workers=writers)
     names = [f"video-{i:05d}" for i in range(videos)]
     submit(store, BatchManifest.of(BATCH, [BatchEntry(name, f"/videos/{name}.mp4", i) for i, name in enumerate(names)]))
     with multiprocessing.get_context("spawn").Pool(writers) as pool:
-        pool.starmap(_write_videos, [(url, names[i::writers]) for i in range(writers)])
+        pool.starmap(_write_videos, [(url, names[i::writers], together) for i in range(writers)])
 
 
-def _write_videos(url: str, names: list[str]) -> None:
+def _write_videos(url: str, names: list[str], together: bool) -> None:
     tables = Tables(ArtifactStore(url))
     for name in names:
-        rng = random.Random(name)
-        for number in (1, 2, 3):
-            if _write_attempt(tables, name, number, rng):
-                break
+        attempts, stages = rows_of(name)
+        for table, rows in (("attempts", attempts), ("stages", stages)):
+            for group in [rows] if together else [[row] for row in rows]:
+                tables.append(table, group, batch=BATCH)
 
 
-def _write_attempt(tables: Tables, name: str, number: int, rng: random.Random) -> bool:
-    """The rows of one run of a video; whether it got through."""
-    failing = rng.choice(STAGES) if rng.random() < FAIL_RATE else None
-    run = {"video_id": name, "run_id": f"{name}-{number}", "attempt_number": number}
-    now = datetime.now(UTC)
-    tables.append("attempts", [{**run, "seq": 0, "state": "scheduled", "at": now}], batch=BATCH)
-    tables.append("attempts", [{**run, "seq": 1, "state": "running", "at": now, "worker": "host:1"}], batch=BATCH)
-    for seq, stage in enumerate(STAGES):
-        wall = rng.gammavariate(4.0, MEAN_S[stage] / 4)
-        row = {**run, "seq": seq, "stage": stage, "stage_version": 1, "started_at": now, "wall_s": wall, "cpu_s": wall}
-        row |= {"key": f"{rng.getrandbits(256):064x}", "knobs": {f"knob_{i}": i / 8 for i in range(12)}}
-        error = {"error_class": "ValueError", "error_message": f"{stage}: expected a person in some frame, got none"}
-        state = {"state": "failed", **error} if stage == failing else {"state": "done", "attempt": f"{name}-{seq}"}
-        tables.append("stages", [{**row, **state}], batch=BATCH)
-        if stage == failing:
-            tables.append("attempts", [{**run, "seq": 9, "state": "failed", "at": now, **error}], batch=BATCH)
-            return False
-    tables.append("attempts", [{**run, "seq": 9, "state": "done", "at": now}], batch=BATCH)
-    return True
+def rows_of(name: str) -> tuple[list[Row], list[Row]]:
+    """Rows of `attempts` and of `stages` that the runs of a video leave."""
+    rng, attempts, stages = random.Random(name), [], []
+    for number in (1, 2, 3):
+        failing = rng.choice(STAGES) if rng.random() < FAIL_RATE else None
+        run = {"video_id": name, "run_id": f"{name}-{number}", "attempt_number": number}
+        now = datetime.now(UTC)
+        attempts.append({**run, "seq": 0, "state": "scheduled", "at": now})
+        attempts.append({**run, "seq": 1, "state": "running", "at": now, "worker": "host:1"})
+        made = STAGES[: STAGES.index(failing) + 1] if failing else STAGES
+        stages += [_stage_row(run, seq, stage, failing, rng) for seq, stage in enumerate(made)]
+        end = {"state": "failed", **ERROR} if failing else {"state": "done"}
+        attempts.append({**run, "seq": 9, "at": now, **end})
+        if not failing:
+            break
+    return attempts, stages
+
+
+def _stage_row(run: Row, seq: int, stage: str, failing: str | None, rng: random.Random) -> Row:
+    wall = rng.gammavariate(4.0, MEAN_S[stage] / 4)
+    row = {**run, "seq": seq, "stage": stage, "stage_version": 1, "started_at": datetime.now(UTC), "wall_s": wall}
+    row |= {"cpu_s": wall, "key": f"{rng.getrandbits(256):064x}", "knobs": {f"knob_{i}": i / 8 for i in range(12)}}
+    return row | ({"state": "failed", **ERROR} if stage == failing else {"state": "done", "attempt": f"a-{seq}"})
 
 
 def measure_status(url: str, repeats: int) -> dict[str, Any]:
@@ -109,16 +116,18 @@ def main() -> None:
     parser.add_argument("--videos", type=int, default=10_000)
     parser.add_argument("--writers", type=int, default=2)
     parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--together", action="store_true", help="a video's rows of one table in one append")
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         url = str(Path(folder) / "store")
         before, started = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
-        write_batch(url, arguments.videos, arguments.writers)
+        write_batch(url, arguments.videos, arguments.writers, arguments.together)
         wall, after = time.perf_counter() - started, resource.getrusage(resource.RUSAGE_CHILDREN)
         files = [path for path in (Path(url) / "tables").rglob("*") if path.is_file()]
         result = {
             "videos": arguments.videos,
+            "together": arguments.together,
             "files": len(files),
             "bytes": sum(path.stat().st_size for path in files),
             "write_s": round(wall, 1),

@@ -128,7 +128,7 @@ def submit(store: ArtifactStore, manifest: BatchManifest) -> tuple[BatchManifest
         CorruptError, StoreVersionError: what is there cannot be read.
         StoreFullError: no room; nothing was written.
     """
-    if store.backend.create(_path(manifest.batch), manifest.to_json()):
+    if store.backend.create(batch_path(manifest.batch), manifest.to_json()):
         return manifest, True
     there = read_batch(store, manifest.batch)
     if there == manifest:
@@ -152,7 +152,7 @@ def read_batch(store: ArtifactStore, batch: str) -> BatchManifest:
         StoreVersionError: a newer version of this software wrote it.
     """
     check_name(batch, "batch")
-    path = _path(batch)
+    path = batch_path(batch)
     try:
         manifest = BatchManifest.from_json(store.backend.read(path))
     except FileNotFoundError:
@@ -201,7 +201,8 @@ def resume_batch(store: ArtifactStore, batch: str) -> None:
     store.backend.remove(_marker(batch))
 
 
-def _path(batch: str) -> str:
+def batch_path(batch: str) -> str:
+    """Where the manifest of a batch lies, relative to the root of the store."""
     return f"batches/{batch}/manifest.json"
 
 

@@ -109,6 +109,10 @@ class Partition:
         """Names of the appended files, leftovers included, sorted."""
         return [name for name in self._listing(self.folder) if name.endswith(".parquet")]
 
+    def head(self) -> int:
+        """Number of the index in force, 0 if nothing was merged."""
+        return max(self._numbers(), default=0)
+
     def index(self) -> Index:
         """The index in force.
 
@@ -116,7 +120,7 @@ class Partition:
             FileNotFoundError: it was replaced meanwhile; ask again.
             CorruptError, StoreVersionError: it cannot be read.
         """
-        if not (number := self._head()):
+        if not (number := self.head()):
             return Index(0)
         path = self._index_path(number)
         try:
@@ -145,7 +149,7 @@ class Partition:
                 parts = merged | self._read(live, columns)
             except FileNotFoundError:
                 continue
-            if self._head() == index.number:
+            if self.head() == index.number:
                 return Snapshot(index, parts, tuple(name for name in appended if name in absorbed))
         raise StoreError(f"{self.folder} kept changing while it was read; read it again once nobody merges it")
 
@@ -168,7 +172,7 @@ class Partition:
         merged, appended = list(snapshot.parts.items())[:count], list(snapshot.parts.items())[count:]
         kept = 0 if everything else _kept(snapshot.index.merged, appended)
         taken = merged[kept:] + (appended if everything else _until_large(appended))
-        if len(taken) < 2 and not (everything and taken and taken[0][1].version != self.schema.version):
+        if len(taken) < 2 and not (everything and taken):
             return len(snapshot.leftovers)
         entry = self._write_merged(taken)
         index = Index(snapshot.index.number + 1, (*snapshot.index.merged[:kept], entry))
@@ -176,7 +180,7 @@ class Partition:
             self.backend.remove(self.merged_path(entry.name))
             return len(snapshot.leftovers)
         # Only who has the head may delete what it replaces: a number below the head decides nothing.
-        if self._head() == index.number:
+        if self.head() == index.number:
             self._remove(path for path, _ in taken)
             self._remove(self._index_path(n) for n in self._numbers() if n <= index.number - _KEPT_INDEXES)
         return len(taken) + len(snapshot.leftovers)
@@ -244,9 +248,6 @@ class Partition:
     def _numbers(self) -> list[int]:
         stems = (name.removesuffix(".json") for name in self._listing(f"{self.folder}/index"))
         return [int(stem) for stem in stems if stem.isdecimal()]
-
-    def _head(self) -> int:
-        return max(self._numbers(), default=0)
 
     def _index_path(self, number: int) -> str:
         return f"{self.folder}/index/{number:06d}.json"

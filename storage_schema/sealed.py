@@ -41,6 +41,27 @@ def unseal(data: bytes, what: str, version: int, upgrades: Mapping[int, BodyUpgr
         CorruptError: the bytes are not a whole, unchanged document.
         StoreVersionError: a newer version of this software wrote it.
     """
+    body = _checked_body(data, what)
+    if body["schema_version"] > version:
+        raise StoreVersionError(
+            f"{what} of schema version {body['schema_version']}, expected at most {version}: a newer "
+            "version of this software wrote this store; install that version, or use another store"
+        )
+    for step in range(body["schema_version"], version):
+        body = {**upgrades[step](body), "schema_version": step + 1}
+    return body
+
+
+def sealed_version(data: bytes, what: str) -> int:
+    """Schema version at which a document was written.
+
+    Raises:
+        CorruptError: the bytes are not a whole, unchanged document.
+    """
+    return int(_checked_body(data, what)["schema_version"])
+
+
+def _checked_body(data: bytes, what: str) -> dict[str, Any]:
     try:
         document = json.loads(data)
         body, expected = document[what], document["sha256"]
@@ -49,11 +70,4 @@ def unseal(data: bytes, what: str, version: int, upgrades: Mapping[int, BodyUpgr
         raise CorruptError(f"{what} is unreadable ({error})") from error
     if not whole or not isinstance(body, dict) or not isinstance(body.get("schema_version"), int):
         raise CorruptError(f"{what} does not have the checksum it was written with")
-    if body["schema_version"] > version:
-        raise StoreVersionError(
-            f"{what} of schema version {body['schema_version']}, expected at most {version}: a newer "
-            "version of this software wrote this store; install that version, or use another store"
-        )
-    for step in range(body["schema_version"], version):
-        body = {**upgrades[step](body), "schema_version": step + 1}
     return body

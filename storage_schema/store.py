@@ -171,7 +171,7 @@ class ArtifactStore:
                 _LOG.info("%s %s was committed by attempt %s first", stage, key[:12], winner.attempt)
                 return winner
             # All of them are damaged, so ours is next. If somebody takes it meanwhile, look again.
-            if self.backend.create(f"{_folder(stage, key)}/{manifest_name(max(generations, default=0) + 1)}", data):
+            if self.backend.create(manifest_path(stage, key, max(generations, default=0) + 1), data):
                 return manifest
 
     def attempt_folder(self, stage: str, key: str, attempt: str) -> str:
@@ -191,7 +191,7 @@ class ArtifactStore:
             StoreVersionError: a newer version of this software wrote it.
             FileNotFoundError: there is none of that number.
         """
-        manifest = Manifest.from_json(self.backend.read(f"{_folder(stage, key)}/{manifest_name(generation)}"))
+        manifest = Manifest.from_json(self.backend.read(manifest_path(stage, key, generation)))
         if (manifest.stage, manifest.key) != (stage, key):
             raise CorruptError(f"manifest is of {manifest.stage} {manifest.key}")
         return manifest
@@ -201,20 +201,29 @@ class ArtifactStore:
         return next((manifest for manifest in found if manifest is not None), None)
 
     def _whole(self, stage: str, key: str, generation: int, verify: bool) -> Manifest | None:
+        found = self.inspect(stage, key, generation, verify=verify)
+        if isinstance(found, Manifest):
+            return found
+        _LOG.warning("%s %s (manifest %d) does not count: %s", stage, key[:12], generation, found)
+        return None
+
+    def inspect(self, stage: str, key: str, generation: int, *, verify: bool = True) -> Manifest | str:
+        """A manifest whose outputs are whole, or the reason why it does not count.
+
+        Raises:
+            StoreVersionError: a newer version of this software wrote it.
+        """
         try:
             manifest = self.read_manifest(stage, key, generation)
             for blob in manifest.blobs:
                 self._verify(blob, verify)
         except (CorruptError, FileNotFoundError, IsADirectoryError) as error:
-            reason = f"{error.filename} is missing" if isinstance(error, OSError) and error.filename else str(error)
+            return f"{error.filename} is missing" if isinstance(error, OSError) and error.filename else str(error)
         except OSError as error:
             if error.errno != errno.EIO:
                 raise
-            reason = f"{error.filename} cannot be read"
-        else:
-            return manifest
-        _LOG.warning("%s %s (manifest %d) does not count: %s", stage, key[:12], generation, reason)
-        return None
+            return f"{error.filename} cannot be read"
+        return manifest
 
     def _verify(self, blob: BlobRef, content: bool) -> None:
         if (size := self.backend.size(blob.path)) != blob.size:
@@ -236,3 +245,8 @@ class ArtifactStore:
 
 def _folder(stage: str, key: str) -> str:
     return f"artifacts/{stage}/{key}"
+
+
+def manifest_path(stage: str, key: str, generation: int) -> str:
+    """Where a manifest lies, relative to the root of the store."""
+    return f"{_folder(stage, key)}/{manifest_name(generation)}"

@@ -135,10 +135,12 @@ class Tables:
         Raises:
             CorruptError, StoreVersionError: a file cannot be read; nothing is changed.
         """
+        return self._partition(table, batch).merge(everything=True) if self.is_outdated(table, batch) else 0
+
+    def is_outdated(self, table: str, batch: str) -> bool:
+        """Whether some of a batch's files are of an older version of the table."""
         partition = self._partition(table, batch)
-        if all(part.version == partition.schema.version for part in partition.snapshot().parts.values()):
-            return 0
-        return partition.merge(everything=True)
+        return any(part.version != partition.schema.version for part in partition.snapshot().parts.values())
 
     def _schema(self, table: str) -> TableSchema:
         if table not in self._schemas:
