@@ -74,7 +74,14 @@ class Fleet:
 
 @dataclass(frozen=True)
 class Use:
-    """How a resource was used: busy share of its capacity, mean wait per request, mean number waiting."""
+    """How a resource was used.
+
+    Attributes:
+        capacity: how many may hold it.
+        utilisation: share of the capacity that was at work; a worker that waits for a slot is not.
+        wait_s: mean wait per request.
+        waiting: mean number of requests that wait.
+    """
 
     capacity: int
     utilisation: float
@@ -104,9 +111,11 @@ def simulate(batch: Sequence[MeasuredVideo], fleet: Fleet) -> Simulated:
         env.process(_video(env, video, fleet, resources))
     env.run()
     makespan = max(resource.last_s for resource in resources.values())
+    # A worker is held while its attempt waits for a slot, but not at work.
+    idle = sum(resource.waited_s for name, resource in resources.items() if name != WORKER)
     return Simulated(
         makespan,
-        {name: resource.use(makespan) for name, resource in resources.items()},
+        {name: resource.use(makespan, idle if name == WORKER else 0.0) for name, resource in resources.items()},
         sum(len(video.attempts) for video in batch),
         sum(not video.attempts[-1].done for video in batch),
     )
@@ -119,7 +128,7 @@ class _Counted:
         self._env = env
         self._resource = simpy.Resource(env, capacity)
         self._capacity = capacity
-        self._busy_s = self._waited_s = self.last_s = 0.0
+        self._busy_s = self.waited_s = self.last_s = 0.0
         self._requests = 0
 
     def held(self, body: Generator[Any, Any, None]) -> Generator[Any, Any, None]:
@@ -130,15 +139,15 @@ class _Counted:
             got = self._env.now
             yield from body
         self._requests += 1
-        self._waited_s += got - asked
+        self.waited_s += got - asked
         self._busy_s += self._env.now - got
         self.last_s = self._env.now
 
-    def use(self, makespan_s: float) -> Use:
+    def use(self, makespan_s: float, idle_s: float) -> Use:
         """Totals as rates."""
         whole = max(makespan_s, np.finfo(float).tiny)
-        wait = self._waited_s / max(self._requests, 1)
-        return Use(self._capacity, self._busy_s / (self._capacity * whole), wait, self._waited_s / whole)
+        wait = self.waited_s / max(self._requests, 1)
+        return Use(self._capacity, (self._busy_s - idle_s) / (self._capacity * whole), wait, self.waited_s / whole)
 
 
 def _video(
