@@ -19,6 +19,7 @@ import pytest
 from fsspec import register_implementation
 from fsspec.implementations.memory import MemoryFileSystem
 
+from storage_schema.batches import BatchEntry, BatchManifest, list_batches, read_batch, submit
 from storage_schema.errors import StoreFullError, StoreUnavailableError, is_full
 from storage_schema.store import ArtifactStore
 from storage_schema.tables import Tables
@@ -109,6 +110,19 @@ def test_a_kill_between_any_two_steps_of_an_append_or_a_compaction_loses_and_dou
             assert step >= 8
             return
     pytest.fail("the compaction never finished")
+
+
+def test_a_kill_between_any_two_steps_of_a_submit_leaves_no_batch_or_all_of_it(tmp_path: Path) -> None:
+    batch = BatchManifest.of("b", [BatchEntry(f"v{i}", f"v{i}.mp4") for i in range(5)])
+    for step in range(100):
+        store = open_store(tmp_path / str(step))
+        code = in_child(lambda: submit(store, batch), step)  # noqa: B023
+        submit(store, batch)
+        assert read_batch(store, "b") == batch and list_batches(store) == ["b"]
+        if code == DONE:
+            assert step >= 4
+            return
+    pytest.fail("the submit never finished")
 
 
 def test_everything_is_flushed_to_the_disk_before_the_manifest_appears(

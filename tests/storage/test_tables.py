@@ -319,6 +319,25 @@ def test_a_merge_that_wakes_up_when_its_number_was_used_and_forgotten_changes_no
     assert tables.compact("frames", "b") and frames(tables) == list(range(15))
 
 
+def test_a_number_below_the_head_decides_nothing_though_it_was_free(
+    store: ArtifactStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tables = Tables(store)
+    _three_rows(tables)
+    slow = tables._partition("frames", "b")
+
+    def publish(index: Index) -> bool:
+        # Others went on to number 5 without these rows, and the number this merge is about to use was cleared away.
+        for number in range(1, 6):
+            assert Partition.publish(slow, Index(number))
+        store.backend.remove(f"tables/frames/batch=b/index/{index.number:06d}.json")
+        return Partition.publish(slow, index)
+
+    monkeypatch.setattr(slow, "publish", publish)
+    slow.merge()
+    assert frames(tables) == [0, 1, 2]
+
+
 def test_an_appended_file_that_comes_back_after_it_was_merged_is_not_counted_twice(store: ArtifactStore) -> None:
     tables = Tables(store)
     _three_rows(tables)
