@@ -349,7 +349,10 @@ def test_an_appended_file_that_comes_back_after_it_was_merged_is_not_counted_twi
     assert tables.compact("frames", "b") == 3 and len(parquet_files(tables)) == 1
 
 
-def test_a_reader_overtaken_by_a_merge_reads_again(store: ArtifactStore, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("when", ["before its listing", "after its listing"])
+def test_a_reader_overtaken_by_a_merge_reads_again(
+    store: ArtifactStore, monkeypatch: pytest.MonkeyPatch, when: str
+) -> None:
     tables, calls = Tables(store), []
     _three_rows(tables)
     real = Partition.appended
@@ -359,6 +362,7 @@ def test_a_reader_overtaken_by_a_merge_reads_again(store: ArtifactStore, monkeyp
         calls.append(names)
         if len(calls) == 1:
             Tables(store).compact("frames", "b")
+            return real(self) if when == "before its listing" else names
         return names
 
     monkeypatch.setattr(Partition, "appended", overtaken)
