@@ -2,8 +2,8 @@
 
 The batch is synthetic, its rows written one by one as runs write them (`storage_schema.tables.Tables.append`, by
 `--writers` processes side by side): per video a row when it is scheduled, when it starts and when it ends, and one per
-stage; one attempt in twenty fails in some stage and is tried again (`--together` writes a video's rows of one table in
-one append, to save time where only the reading is asked for). Then `status` runs `--repeats` times in a fresh
+stage; one attempt in twenty fails in some stage and is tried again (`--together N` writes the rows of N
+videos in one append, to save time where only the reading is asked for). Then `status` runs `--repeats` times in a fresh
 process each, on one core: `status_s` is its wall time with the interpreter's start and all imports, `status_cpu_s` its
 CPU time. `files` and `bytes` are what it found in the store.
 """
@@ -47,7 +47,7 @@ print(status.total, status.videos["done"])
 """
 
 
-def write_batch(url: str, videos: int, writers: int = 2, together: bool = False) -> None:
+def write_batch(url: str, videos: int, writers: int = 2, together: int = 0) -> None:
     """Submit a batch of `videos` and write the rows of all its runs."""
     store = ArtifactStore(url, workers=writers)
     names = [f"video-{i:05d}" for i in range(videos)]
@@ -56,11 +56,12 @@ def write_batch(url: str, videos: int, writers: int = 2, together: bool = False)
         pool.starmap(_write_videos, [(url, names[i::writers], together) for i in range(writers)])
 
 
-def _write_videos(url: str, names: list[str], together: bool) -> None:
+def _write_videos(url: str, names: list[str], together: int) -> None:
     tables = Tables(ArtifactStore(url))
-    for name in names:
-        attempts, stages = rows_of(name)
-        for table, rows in (("attempts", attempts), ("stages", stages)):
+    for start in range(0, len(names), together or 1):
+        videos = [rows_of(name) for name in names[start : start + (together or 1)]]
+        for k, table in enumerate(("attempts", "stages")):
+            rows = [row for video in videos for row in video[k]]
             for group in [rows] if together else [[row] for row in rows]:
                 tables.append(table, group, batch=BATCH)
 
@@ -116,7 +117,7 @@ def main() -> None:
     parser.add_argument("--videos", type=int, default=10_000)
     parser.add_argument("--writers", type=int, default=2)
     parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--together", action="store_true", help="a video's rows of one table in one append")
+    parser.add_argument("--together", type=int, default=0, help="videos in one append; by default every row its own")
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
