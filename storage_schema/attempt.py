@@ -14,6 +14,7 @@ from storage_schema.check import check
 from storage_schema.errors import StoreError, StoreFullError, free_bytes, is_full
 from storage_schema.keys import canonical
 from storage_schema.manifest import SCHEMA_VERSION, BlobRef, Manifest, content_hash
+from storage_schema.secrets import redact_json
 
 if TYPE_CHECKING:
     from storage_schema.store import ArtifactStore
@@ -58,7 +59,7 @@ class Attempt:
             config: the validated configuration.
             inputs: input name -> content hash of the input artifact.
             roles: role -> who filled it (name, licence, sha256 of the weights).
-            summary: results as JSON types.
+            summary: results as JSON types; secrets that they hold are taken out.
 
         Returns:
             The manifest under the key: ours, or that of a worker who was faster (our files are then deleted).
@@ -71,7 +72,7 @@ class Attempt:
         """
         if not self._open:
             raise StoreError(f"attempt {self.name} at {self.stage} is over; start a new one with store.attempt")
-        parts = {"config": config, "inputs": inputs, "roles": roles or {}, "summary": summary or {}}
+        parts = {"config": config, "inputs": inputs, "roles": roles or {}, "summary": redact_json(summary or {})}
         plain = {name: canonical(value, name) for name, value in parts.items()}
         names = check(self.stage, self.dir, self._store.artifacts)
         self._open = False

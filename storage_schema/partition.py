@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import logging
 import uuid
-from collections import OrderedDict
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
@@ -23,6 +22,7 @@ import pyarrow as pa
 
 from storage_schema.backend import Backend
 from storage_schema.errors import CorruptError, StoreError
+from storage_schema.part_cache import PartCache
 from storage_schema.rows import Part, from_parquet, to_parquet
 from storage_schema.schemas import TableSchema
 from storage_schema.sealed import seal, unseal
@@ -36,7 +36,6 @@ _READ_TRIES = 20
 _GROWTH = 4
 # Merging holds its rows in memory, in a process that has better things to do with it.
 _MERGE_BYTES = 64 << 20
-_CACHE_BYTES = 256 << 20
 # Older indexes are kept for readers whose listing is a moment old.
 _KEPT_INDEXES = 3
 _DOWNLOADS = 8
@@ -66,29 +65,6 @@ class Snapshot:
     index: Index
     parts: dict[str, Part]
     leftovers: tuple[str, ...]  # appended files that a merged one stands for
-
-
-class PartCache:
-    """Files that were read, which never change under their names; the least used go when they are too many."""
-
-    def __init__(self, limit: int = _CACHE_BYTES) -> None:
-        self._limit = limit
-        self._bytes = 0
-        self._parts: OrderedDict[tuple[str, tuple[str, ...]], Part] = OrderedDict()
-
-    def get(self, path: str, columns: Sequence[str]) -> Part | None:
-        """The file, if it was read with these columns."""
-        key = (path, tuple(columns))
-        if (part := self._parts.get(key)) is not None:
-            self._parts.move_to_end(key)
-        return part
-
-    def put(self, path: str, columns: Sequence[str], part: Part) -> None:
-        """Keep a file that was read."""
-        self._bytes += part.rows.nbytes
-        self._parts[(path, tuple(columns))] = part
-        while self._bytes > self._limit:
-            self._bytes -= self._parts.popitem(last=False)[1].rows.nbytes
 
 
 @dataclass

@@ -19,7 +19,8 @@ import pyarrow.parquet as pq
 
 from storage_schema.errors import StoreError
 from storage_schema.manifest import check_name
-from storage_schema.partition import PartCache, Partition, partition_folder
+from storage_schema.part_cache import PartCache
+from storage_schema.partition import Partition, partition_folder
 from storage_schema.rows import rows_to_table, to_parquet
 from storage_schema.schemas import TABLES, TableSchema
 from storage_schema.store import ArtifactStore

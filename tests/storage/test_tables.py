@@ -12,7 +12,9 @@ import pyarrow.compute as pc
 import pytest
 
 from storage_schema.errors import ArtifactError, CorruptError, StoreVersionError
+from storage_schema.part_cache import PartCache
 from storage_schema.partition import Index, Partition
+from storage_schema.rows import Part, rows_to_table
 from storage_schema.schemas import TABLES, TableSchema
 from storage_schema.store import ArtifactStore
 from storage_schema.tables import Tables
@@ -182,6 +184,18 @@ def test_unknown_tables_and_bad_batches_are_refused(tables: Tables) -> None:
         for use in (lambda b: tables.append("frames", [], batch=b), lambda b: tables.read("frames", b)):
             with pytest.raises(ArtifactError, match="batch: expected"):
                 use(batch)
+
+
+def test_what_is_remembered_of_tables_stays_within_its_limit() -> None:
+    row = {**REQUIRED["frames"], "pose": np.zeros(100)}
+    part = Part(rows_to_table(TABLES["frames"], [row], "b"), 1, frozenset())
+    cache = PartCache(limit=3 * part.rows.nbytes)
+    for n in range(6):
+        for _ in range(2):
+            cache.put(f"{n}", (), part)
+        cache.get("0", ())
+    kept = [n for n in range(6) if cache.get(f"{n}", ()) is not None]
+    assert kept == [0, 4, 5], "what is used stays, the oldest of the others goes"
 
 
 def parquet_files(tables: Tables, table: str = "frames") -> list[str]:
