@@ -77,12 +77,16 @@ def attempt(video, number):
     tell(1, "done")
     return True
 
+entries = read_batch(store, "b").entries
 (root / f"ready-{me}").touch()
 while not all((root / f"ready-{other}").exists() for other in range(workers)):
     time.sleep(0.005)
-for entry in read_batch(store, "b").entries:
-    if store.backend.create(f"claims/{entry.video_id}", b"1"):
-        attempt(entry.video_id, 1) or attempt(entry.video_id, 2)
+for entry in entries:
+    try:
+        (root / f"claim-{entry.video_id}").open("x").close()
+    except FileExistsError:
+        continue
+    attempt(entry.video_id, 1) or attempt(entry.video_id, 2)
 """
 
 

@@ -169,7 +169,7 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 def use(endpoint: str, **config: Any) -> None:
-    """Send every `s3://` of this process to `endpoint`, with short waits so that tests are quick."""
-    quick = {"connect_timeout": 2, "read_timeout": 2, "retries": {"max_attempts": 1, "mode": "standard"}, **config}
+    """Send every `s3://` of this process to `endpoint`; few tries, so that what fails fails soon."""
+    quick = {"connect_timeout": 30, "read_timeout": 30, "retries": {"max_attempts": 1, "mode": "standard"}, **config}
     options = {"key": "test", "secret": "test", "client_kwargs": {"region_name": "us-east-1"}}
     fsspec.config.conf["s3"] = {**options, "endpoint_url": endpoint, "config_kwargs": quick}

@@ -244,9 +244,10 @@ def test_a_power_cut_at_any_write_of_a_merge_loses_and_doubles_no_row(url: str, 
 def test_one_fault_at_any_request_of_a_commit_is_survived_or_said_and_never_seen_twice(
     url: str, proxy: Proxy, tmp_path: Path, how: str
 ) -> None:
-    s3fs.S3FileSystem.clear_instance_cache()
-    use(proxy.url, read_timeout=0.3)
-    store = open_s3(url, tmp_path)
+    patient = open_s3(url, tmp_path)
+    if how == "hang":
+        use(proxy.url, read_timeout=1)
+    store = open_store(url, tmp_path / "cache")
     for step in range(3):
         key = f"{step:064d}"
         proxy.plan, _ = cut_after(step, how, for_good=False)
@@ -255,11 +256,11 @@ def test_one_fault_at_any_request_of_a_commit_is_survived_or_said_and_never_seen
         except (OSError, StoreError):
             manifest = None
         proxy.plan = lambda method, path: "pass"
-        found = store.lookup(key)
+        found = patient.lookup(key)
         if manifest is not None:
             assert found == manifest, "what was said to be committed is there"
-        assert load(store, found or commit(store, 1.0, key)) == 1.0
-        names = store.backend.names(f"artifacts/toy/{key}")
+        assert load(patient, found or commit(patient, 1.0, key)) == 1.0
+        names = patient.backend.names(f"artifacts/toy/{key}")
         assert len([name for name in names if name.startswith("manifest")]) == 1
 
 
