@@ -131,7 +131,9 @@ def test_the_command_says_the_same(batch: ArtifactStore) -> None:
     answer = CliRunner().invoke(app, [*ask, "--json"])
     assert answer.exit_code == 0, answer.output
     plain = json.loads(answer.output)
-    assert plain["measured_videos"] == VIDEOS and plain["bottleneck"] == "gpu"
+    uses = plain["uses"]
+    assert plain["measured_videos"] == VIDEOS and set(uses) == {"worker", "gpu"}
+    assert plain["bottleneck"] == max(uses, key=lambda name: uses[name]["utilisation"])
     shown = CliRunner().invoke(app, ask)
     assert "bottleneck" in shown.output and "40 videos on 4 workers (4 machines)" in shown.output
 
