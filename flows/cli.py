@@ -12,13 +12,16 @@ from pydantic import ValidationError
 from rich.console import Console
 from rich.markup import escape
 
-from flows import models_cli
+from flows import models_cli, plan_cli, store_cli
+from storage_schema.secrets import RedactSecrets
 
 if TYPE_CHECKING:
     from flows.request import VideoRequest
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 app.add_typer(models_cli.app, name="models")
+app.add_typer(store_cli.app, name="store")
+app.command("plan")(plan_cli.plan)
 
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
@@ -30,6 +33,8 @@ def main(verbose: Annotated[bool, typer.Option("--verbose", "-v", help="log what
     logging.basicConfig(
         level=logging.INFO if verbose else logging.WARNING, format="%(levelname)s %(name)s: %(message)s"
     )
+    for handler in logging.getLogger().handlers:
+        handler.addFilter(RedactSecrets())
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # spinning threads made a training step six times slower
     os.environ.setdefault("PREFECT_SERVER_ANALYTICS_ENABLED", "false")
     os.environ.setdefault("DO_NOT_TRACK", "1")

@@ -14,6 +14,7 @@ from storage_schema.check import check
 from storage_schema.errors import StoreError, StoreFullError, free_bytes, is_full
 from storage_schema.keys import canonical
 from storage_schema.manifest import SCHEMA_VERSION, BlobRef, Manifest, content_hash
+from storage_schema.secrets import redact_json
 
 if TYPE_CHECKING:
     from storage_schema.store import ArtifactStore
@@ -58,7 +59,7 @@ class Attempt:
             config: the validated configuration.
             inputs: input name -> content hash of the input artifact.
             roles: role -> who filled it (name, licence, sha256 of the weights).
-            summary: results as JSON types.
+            summary: results as JSON types; secrets that they hold are taken out.
 
         Returns:
             The manifest under the key: ours, or that of a worker who was faster (our files are then deleted).
@@ -71,7 +72,7 @@ class Attempt:
         """
         if not self._open:
             raise StoreError(f"attempt {self.name} at {self.stage} is over; start a new one with store.attempt")
-        parts = {"config": config, "inputs": inputs, "roles": roles or {}, "summary": summary or {}}
+        parts = {"config": config, "inputs": inputs, "roles": roles or {}, "summary": redact_json(summary or {})}
         plain = {name: canonical(value, name) for name, value in parts.items()}
         names = check(self.stage, self.dir, self._store.artifacts)
         self._open = False
@@ -129,10 +130,10 @@ class Attempt:
         backend = self._store.backend
         path = f"{self._store.attempt_folder(self.stage, self.key, self.name)}/{name}"
         size = (self.dir / name).stat().st_size
-        backend.put(self.dir / name, path)
+        digest = backend.put(self.dir / name, path)
         if backend.size(path) != size:
             raise StoreError(f"{path} has {backend.size(path)} bytes in the store, {size} were written; run again")
-        return BlobRef(name, path, size, backend.sha256(path))
+        return BlobRef(name, path, size, digest)
 
     def _discard(self, *, published: bool) -> None:
         """Delete what the attempt left. A failure costs space, never correctness: `ArtifactStore.gc` finds it later."""

@@ -19,6 +19,7 @@ from fsspec.implementations.local import LocalFileSystem
 
 from storage_schema.errors import StoreError, room_for
 from storage_schema.keys import file_sha256
+from storage_schema.secrets import redact_url
 
 # What link(2) answers on file systems without hard links (FAT, some network and virtual machine mounts).
 _NO_LINKS = frozenset({errno.EPERM, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK})
@@ -36,8 +37,8 @@ class Backend(Protocol):
     def write(self, path: str, data: bytes) -> None:
         """Write a whole file as one step, over what may be there."""
 
-    def put(self, source: Path, path: str) -> None:
-        """Bring a local file into the store; `source` may be gone afterwards."""
+    def put(self, source: Path, path: str) -> str:
+        """Bring a local file into the store and return `sha256(path)`; `source` may be gone afterwards."""
 
     def read(self, path: str) -> bytes:
         """All bytes of a file; FileNotFoundError if there is none."""
@@ -78,12 +79,17 @@ def open_backend(url: str | Path, workers: int = 1) -> Backend:
         workers: how many processes or machines will write at the same time.
 
     Raises:
-        StoreError: several workers on a file system that cannot create a file only if it is absent, or a file's path.
+        StoreError: several workers on a file system that cannot create a file only if it is absent, a file's path, or a
+            package for this kind of store is missing.
         ValueError: no file system is known for the URL.
     """
     from storage_schema.remote import RemoteBackend
 
-    fs, root = url_to_fs(str(url), use_listings_cache=False)
+    try:
+        fs, root = url_to_fs(str(url), use_listings_cache=False)
+    except ImportError as error:
+        extra = str(url).split("://", 1)[0]
+        raise StoreError(f"{redact_url(str(url))}: {error}; pip install 'ahoy-avatars[{extra}]'") from error
     if isinstance(fs, LocalFileSystem):
         return LocalBackend(Path(root))
     return RemoteBackend(fs, root, workers)
@@ -136,7 +142,7 @@ class LocalBackend:
                 raise
             flush_folder(target.parent)
 
-    def put(self, source: Path, path: str) -> None:
+    def put(self, source: Path, path: str) -> str:
         """Move a file of this machine into the store (it has to lie on the same disk: see `new_folder`)."""
         target = self.root / path
         with room_for(target, source.stat().st_size):
@@ -145,6 +151,7 @@ class LocalBackend:
                 os.fsync(file.fileno())
             source.replace(target)
             flush_folder(target.parent)
+        return self.sha256(path)
 
     def read(self, path: str) -> bytes:
         """See `Backend`."""
@@ -235,6 +242,16 @@ def flush_folder(folder: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def store_time(backend: Backend) -> float:
+    """What the store's own clock says, seconds since the epoch: ages are told by it, not by that of whoever asks."""
+    probe = f"{SCRATCH}/clock-{uuid.uuid4().hex}"
+    backend.write(probe, b"1")
+    try:
+        return backend.modified(probe)
+    finally:
+        backend.remove(probe)
 
 
 def newest(backend: Backend, paths: list[str]) -> float:

@@ -8,10 +8,19 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from storage_schema.secrets import redact
+
 # EFBIG is what a process or file-system limit on file size gives: for the user it is the same problem.
 _FULL_ERRNOS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 # Writers in other languages (safetensors, torch, FFmpeg) report a full disk in words only.
-_FULL_WORDS = ("no space left on device", "disk quota exceeded", "file too large")
+# The last two are an object store's: its disks are full, or the bucket has all that it may hold.
+_FULL_WORDS = (
+    "no space left on device",
+    "disk quota exceeded",
+    "file too large",
+    "minimum free drive threshold",
+    "bucket quota exceeded",
+)
 
 
 class StoreError(Exception):
@@ -24,6 +33,14 @@ class StoreVersionError(StoreError):
 
 class CorruptError(StoreError):
     """Bytes in the store are not those that were committed."""
+
+
+class UnknownBatchError(StoreError):
+    """The store has no batch of that name."""
+
+
+class BatchExistsError(StoreError):
+    """A batch of that name is there already, made from another list; the message says what differs."""
 
 
 class ArtifactError(ValueError):
@@ -51,6 +68,16 @@ class StoreFullError(OSError):
         return str(self.strerror)
 
 
+class StoreUnavailableError(OSError):
+    """The store did not answer, or not with what was asked for: trying again later may help."""
+
+    def __init__(self, where: str, error: BaseException) -> None:
+        super().__init__(errno.EHOSTUNREACH, f"{where}: {redact(str(error)) or type(error).__name__}; try again later")
+
+    def __str__(self) -> str:
+        return str(self.strerror)
+
+
 def is_full(error: BaseException | None) -> bool:
     """True if `error`, or what caused it, says that a file system is full or a file-size limit was met."""
     seen: set[int] = set()
@@ -65,7 +92,9 @@ def is_full(error: BaseException | None) -> bool:
 
 
 def free_bytes(path: str | Path) -> int | None:
-    """Bytes free under the nearest existing folder of `path`; None if it cannot be told."""
+    """Bytes free under the nearest existing folder of `path`; None if it cannot be told, as of a URL."""
+    if "://" in str(path):
+        return None
     folder = Path(path)
     while not folder.exists() and folder != folder.parent:
         folder = folder.parent
@@ -85,4 +114,4 @@ def room_for(path: str | Path, needed: int) -> Iterator[None]:
     except Exception as error:
         if not is_full(error):
             raise
-        raise StoreFullError(Path(path), needed, free_bytes(path)) from error
+        raise StoreFullError(path, needed, free_bytes(path)) from error

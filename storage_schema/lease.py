@@ -1,14 +1,18 @@
 """Leases: a worker says that it is at work on a key, so that others do something else meanwhile.
 
 A lease is a numbered file made by create-if-absent. The one who makes number n+1, once number n has expired, holds the
-lease: of two who try, one does. It only saves work; what is published is decided by the commit alone. Expiry is by the
-clocks of the workers, which have to agree to well within the time to live.
+lease: of two who try, one does. It only saves work; what is published is decided by the commit alone.
+
+Clocks of different machines need not agree. A holder renews by making the next number, so whoever watches for one time
+to live by the own steady clock and sees no new number knows that the holder is gone, whatever the dates say. Dates
+alone are believed on the machine that wrote them, and where they lie so far back that no clock is that wrong.
 """
 
 from __future__ import annotations
 
 import json
 import logging
+import platform
 import threading
 import time
 import uuid
@@ -20,15 +24,19 @@ from storage_schema.backend import Backend
 
 _LOG = logging.getLogger(__name__)
 _FIRST_WAIT_S, _LONGEST_WAIT_S = 0.05, 5.0
+# Clocks of machines that run a batch together are taken to agree to this; no harm but double work if they do not.
+_SKEW_S = 300.0
 
 
 @dataclass(frozen=True)
 class Holder:
-    """Who holds a lease: `owner` for people, `token` unique, until `expires_at` (seconds since the epoch)."""
+    """Who holds a lease: `owner` for people, `token` unique, until `expires_at` by the clock of `host`, in seconds."""
 
     owner: str
     token: str
     expires_at: float
+    ttl_s: float
+    host: str
 
 
 class Lease:
@@ -46,6 +54,8 @@ class Lease:
         self._wait_s = wait_s
         self._stop = threading.Event()
         self._renewer: threading.Thread | None = None
+        self._host = platform.node()
+        self._seen: dict[int, tuple[str, float]] = {}
 
     def __bool__(self) -> bool:
         return self.held
@@ -94,9 +104,19 @@ class Lease:
                 holder = Holder(**json.loads(self._backend.read(self._path(number))))
             except (FileNotFoundError, ValueError, TypeError):
                 continue
-            if holder.expires_at > time.time():
+            if not self._is_over(number, holder):
                 live[number] = holder
         return live
+
+    def _is_over(self, number: int, holder: Holder) -> bool:
+        late_s = time.time() - holder.expires_at
+        if holder.host == self._host:
+            return late_s >= 0
+        token, since = self._seen.setdefault(number, (holder.token, time.monotonic()))
+        if token != holder.token:
+            since = time.monotonic()
+            self._seen[number] = (holder.token, since)
+        return late_s > _SKEW_S or time.monotonic() - since > holder.ttl_s
 
     def _take(self) -> bool:
         """Make the next number, unless somebody else's lease is live."""
@@ -104,7 +124,7 @@ class Lease:
         if any(holder.token != self._token for holder in live.values()):
             return False
         mine = max(numbers, default=0) + 1
-        holder = Holder(self._owner, self._token, time.time() + self._ttl_s)
+        holder = Holder(self._owner, self._token, time.time() + self._ttl_s, self._ttl_s, self._host)
         if not self._backend.create(self._path(mine), json.dumps(asdict(holder)).encode("utf-8")):
             return False
         # A release between our look and our step can let a second one in at a lower number: that one keeps it.

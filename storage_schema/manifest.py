@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
-from storage_schema.errors import ArtifactError, CorruptError, StoreVersionError
-from storage_schema.keys import canonical, canonical_json
+from storage_schema.errors import ArtifactError, CorruptError
+from storage_schema.keys import canonical_json
+from storage_schema.sealed import BodyUpgrade, seal, unseal
 
 SCHEMA_VERSION = 1
+# Version -> what turns the body of a manifest of that version into one of the next.
+UPGRADES: Mapping[int, BodyUpgrade] = {}
 
 # Four digits sort well in a listing; more follow without harm, the order is numeric.
 _MANIFEST_NAME = re.compile(r"manifest\.(\d{4,9})\.json")
@@ -82,24 +84,17 @@ class Manifest:
 
     def to_json(self) -> bytes:
         """Readable JSON with a checksum of itself, so that a damaged manifest is never taken for a whole one."""
-        body = canonical(asdict(self), "manifest")
-        document = {"sha256": hashlib.sha256(canonical_json(body)).hexdigest(), "manifest": body}
-        return (json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode("utf-8")
+        return seal(asdict(self), "manifest")
 
     @classmethod
     def from_json(cls, data: bytes) -> Manifest:
-        """Read what `to_json` wrote.
+        """Read what `to_json` wrote, at this or an older version.
 
         Raises:
             CorruptError: the bytes are not a whole, unchanged manifest.
             StoreVersionError: a newer version of this software wrote it.
         """
-        body = _checked_body(data)
-        if body["schema_version"] > SCHEMA_VERSION:
-            raise StoreVersionError(
-                f"manifest of schema version {body['schema_version']}, expected at most {SCHEMA_VERSION}: a newer "
-                "version of this software wrote this store; install that version, or use another store"
-            )
+        body = unseal(data, "manifest", SCHEMA_VERSION, UPGRADES)
         if set(body) != {field.name for field in fields(cls)}:
             raise CorruptError(
                 f"manifest has fields {sorted(body)}, expected {sorted(field.name for field in fields(cls))}"
@@ -153,15 +148,3 @@ def check_name(name: str, what: str) -> None:
             f"{what}: expected 1 to 128 letters, digits, '.', '_' or '-', not starting with '.' or '-' "
             f"and not ending with '.', got {name!r}"
         )
-
-
-def _checked_body(data: bytes) -> dict[str, Any]:
-    try:
-        document = json.loads(data)
-        body, expected = document["manifest"], document["sha256"]
-        whole = hashlib.sha256(canonical_json(body)).hexdigest() == expected
-    except (ValueError, TypeError, KeyError) as error:
-        raise CorruptError(f"manifest is unreadable ({error})") from error
-    if not whole or not isinstance(body, dict) or not isinstance(body.get("schema_version"), int):
-        raise CorruptError("manifest does not have the checksum it was written with")
-    return body

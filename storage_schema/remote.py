@@ -7,13 +7,15 @@ import logging
 import threading
 import time
 import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from fsspec import AbstractFileSystem
 from fsspec.implementations.memory import MemoryFileSystem
 
-from storage_schema.errors import StoreError, room_for
+from storage_schema.errors import StoreError, StoreFullError, StoreUnavailableError, is_full, room_for
 from storage_schema.keys import file_sha256
 
 _LOG = logging.getLogger(__name__)
@@ -21,6 +23,20 @@ _CHUNK = 1 << 20
 # memory:// tests for a file and then writes it. One lock for the process makes the two one step; no other process sees
 # that memory.
 _CREATE = threading.Lock()
+# Object stores have no folders to make; asking for one costs a request, or makes a bucket of a misspelt name.
+_FLAT = frozenset({"s3", "s3a", "gs", "gcs", "abfs", "az"})
+# What a server that works can answer.
+_ANSWERS = (
+    FileNotFoundError,
+    FileExistsError,
+    IsADirectoryError,
+    NotADirectoryError,
+    PermissionError,
+    StoreFullError,
+    StoreUnavailableError,
+)
+# Their errors are no OSError, though they mean one.
+_CLIENTS = frozenset({"botocore", "aiobotocore", "aiohttp", "gcsfs", "adlfs", "azure", "google", "requests"})
 
 
 class RemoteBackend:
@@ -30,6 +46,8 @@ class RemoteBackend:
         self.fs = fs
         self.root = root.rstrip("/")
         self.url = str(fs.unstrip_protocol(self.root))
+        protocols = {fs.protocol} if isinstance(fs.protocol, str) else set(fs.protocol)
+        self._flat = bool(protocols & _FLAT)
         self._conditional: bool | None = None
         if workers > 1:
             self._refuse_several_workers(workers)
@@ -43,24 +61,26 @@ class RemoteBackend:
 
     def write(self, path: str, data: bytes) -> None:
         """See `Backend`."""
-        self._make_parent(path)
-        self.fs.pipe_file(self._full(path), data)
+        with self._sending(path, len(data)):
+            self.fs.pipe_file(self._full(path), data)
 
-    def put(self, source: Path, path: str) -> None:
-        """Upload a file and read it back.
+    def put(self, source: Path, path: str) -> str:
+        """Upload a file, read it back, and return the hash of what arrived.
 
         Raises:
             StoreError: what was read back is not what was sent.
         """
-        self._make_parent(path)
-        self.fs.put_file(str(source), self._full(path))
-        if self.sha256(path) != file_sha256(source):
+        with self._sending(path, source.stat().st_size):
+            self.fs.put_file(str(source), self._full(path))
+        if (arrived := self.sha256(path)) != file_sha256(source):
             self.remove(path)
             raise StoreError(f"upload of {source.name} to {self.url}/{path} arrived damaged; run again")
+        return arrived
 
     def read(self, path: str) -> bytes:
         """See `Backend`."""
-        return bytes(self.fs.cat_file(self._full(path)))
+        with self._asking(path):
+            return bytes(self.fs.cat_file(self._full(path)))
 
     def size(self, path: str) -> int:
         """See `Backend`."""
@@ -69,7 +89,7 @@ class RemoteBackend:
     def sha256(self, path: str) -> str:
         """See `Backend`."""
         digest = hashlib.sha256()
-        with self.fs.open(self._full(path), "rb") as file:
+        with self._asking(path), self.fs.open(self._full(path), "rb") as file:
             while piece := file.read(_CHUNK):
                 digest.update(piece)
         return digest.hexdigest()
@@ -77,7 +97,8 @@ class RemoteBackend:
     def modified(self, path: str) -> float:
         """See `Backend`; now, where the file system does not say, so that nothing is taken for old."""
         try:
-            return float(self.fs.modified(self._full(path)).timestamp())
+            with self._asking(path):
+                return float(self.fs.modified(self._full(path)).timestamp())
         except NotImplementedError:
             return time.time()
 
@@ -85,7 +106,8 @@ class RemoteBackend:
         """See `Backend`."""
         self.fs.invalidate_cache()
         try:
-            entries = self.fs.ls(self._full(path), detail=False)
+            with self._asking(path):
+                entries = self.fs.ls(self._full(path), detail=False)
         except (FileNotFoundError, NotADirectoryError):
             return []
         return sorted({str(entry).rstrip("/").rsplit("/", 1)[-1] for entry in entries})
@@ -95,14 +117,16 @@ class RemoteBackend:
         self.fs.invalidate_cache()
         prefix = self.root + "/"
         try:
-            return sorted(str(file).removeprefix(prefix) for file in self.fs.find(self._full(path)))
+            with self._asking(path):
+                return sorted(str(file).removeprefix(prefix) for file in self.fs.find(self._full(path)))
         except FileNotFoundError:
             return []
 
     def remove(self, path: str) -> None:
         """See `Backend`."""
         try:
-            self.fs.rm(self._full(path), recursive=True)
+            with self._asking(path):
+                self.fs.rm(self._full(path), recursive=True)
         except FileNotFoundError:
             return
 
@@ -112,7 +136,7 @@ class RemoteBackend:
 
     def download(self, path: str, target: Path) -> None:
         """See `Backend`."""
-        with room_for(target, self.size(path)):
+        with room_for(target, self.size(path)), self._asking(path):
             self.fs.get_file(self._full(path), str(target))
 
     def new_folder(self, name: str, fallback: Path) -> Path:
@@ -127,7 +151,8 @@ class RemoteBackend:
 
     def _info(self, path: str) -> dict[str, Any]:
         self.fs.invalidate_cache()
-        return dict(self.fs.info(self._full(path)))
+        with self._asking(path):
+            return dict(self.fs.info(self._full(path)))
 
     def _exists(self, path: str) -> bool:
         try:
@@ -136,16 +161,40 @@ class RemoteBackend:
             return False
         return True
 
-    def _make_parent(self, path: str) -> None:
-        self.fs.makedirs(self._full(path).rsplit("/", 1)[0], exist_ok=True)
+    @contextmanager
+    def _asking(self, path: str) -> Iterator[None]:
+        """One kind of error for every way in which a network, a client library or a server can fail."""
+        try:
+            yield
+        except _ANSWERS:
+            raise
+        except Exception as error:
+            foreign = type(error).__module__.partition(".")[0] in _CLIENTS
+            if is_full(error) or not (foreign or isinstance(error, OSError)):
+                raise
+            raise StoreUnavailableError(f"{self.url}/{path}", error) from error
+
+    @contextmanager
+    def _sending(self, path: str, size: int) -> Iterator[None]:
+        """Make the folder, where there are folders, and say what a failure means for who sends `size` bytes."""
+        try:
+            with room_for(f"{self.url}/{path}", size), self._asking(path):
+                if not self._flat:
+                    self.fs.makedirs(self._full(path).rsplit("/", 1)[0], exist_ok=True)
+                yield
+        except FileNotFoundError as error:
+            raise StoreError(
+                f"{self.url}: expected a bucket that is there ({error}); create it, or check --store"
+            ) from error
 
     def _create(self, path: str, data: bytes) -> bool:
-        self._make_parent(path)
+        conditional = self._can_create()
         try:
-            if self._can_create():
-                self.fs.pipe_file(self._full(path), data, mode="create")
-            else:
-                self.fs.pipe_file(self._full(path), data)
+            with self._sending(path, len(data)):
+                if conditional:
+                    self.fs.pipe_file(self._full(path), data, mode="create")
+                else:
+                    self.fs.pipe_file(self._full(path), data)
         except FileExistsError:
             return False
         return True
@@ -154,10 +203,10 @@ class RemoteBackend:
         """Whether the file system keeps the promise of mode="create"; tried, because many accept and ignore it."""
         if self._conditional is None:
             probe = f"scratch/probe-{uuid.uuid4().hex}"
-            self._make_parent(probe)
             try:
-                self.fs.pipe_file(self._full(probe), b"1", mode="create")
-                self.fs.pipe_file(self._full(probe), b"2", mode="create")
+                with self._sending(probe, 1):
+                    self.fs.pipe_file(self._full(probe), b"1", mode="create")
+                    self.fs.pipe_file(self._full(probe), b"2", mode="create")
                 self._conditional = False
             except FileExistsError:
                 self._conditional = True

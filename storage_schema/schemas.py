@@ -12,6 +12,7 @@ from storage_schema.errors import StoreVersionError
 Upgrade = Callable[[pa.Table], pa.Table]
 
 STATES = ("done", "cached", "skipped", "failed")
+ATTEMPT_STATES = ("scheduled", "running", "done", "failed", "crashed", "cancelled")
 
 
 @dataclass(frozen=True)
@@ -26,6 +27,7 @@ class TableSchema:
             current.
         choices: column -> the only values it may have.
         json: columns whose values are mappings, kept as canonical JSON text.
+        redacted: columns of free text or addresses, from which secrets are taken out when they are written.
     """
 
     name: str
@@ -34,6 +36,7 @@ class TableSchema:
     upgrades: Mapping[int, Upgrade] = field(default_factory=dict)
     choices: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     json: tuple[str, ...] = ()
+    redacted: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if sorted(self.upgrades) != list(range(1, self.version)):
@@ -67,9 +70,60 @@ def _column(name: str, kind: pa.DataType, *, optional: bool = False) -> pa.Field
     return pa.field(name, kind, nullable=optional)
 
 
+def _with_order(table: pa.Table) -> pa.Table:
+    """Stages 1 -> 2: rows of before count as a first attempt's, in the order in which they are read."""
+    ones, zeros = (pa.array([value] * table.num_rows, pa.int32()) for value in (1, 0))
+    return table.append_column("attempt_number", ones).append_column("seq", zeros)
+
+
+_VIDEOS = TableSchema(
+    name="videos",
+    version=1,
+    columns=pa.schema(
+        [
+            _column("video_id", pa.string()),
+            _column("source", pa.string()),  # path or URL, without credentials
+            _column("content_hash", pa.string(), optional=True),  # null until the file was read
+            _column("title", pa.string(), optional=True),
+            _column("duration_s", pa.float64(), optional=True),
+            _column("fps", pa.float64(), optional=True),
+            _column("width", pa.int32(), optional=True),  # pixels, display orientation
+            _column("height", pa.int32(), optional=True),
+            _column("frames", pa.int64(), optional=True),
+            _column("options", pa.string(), optional=True),  # JSON
+        ]
+    ),
+    json=("options",),
+    redacted=("source", "title"),
+)
+
+_ATTEMPTS = TableSchema(
+    name="attempts",
+    version=1,
+    columns=pa.schema(
+        [
+            _column("video_id", pa.string()),
+            _column("run_id", pa.string()),  # the process that tried; also in `stages`
+            _column("attempt_number", pa.int32()),  # of the video, from 1; a rerun has the next
+            _column("seq", pa.int32()),  # orders the rows of one attempt, whatever the clocks say
+            _column("state", pa.string()),
+            _column("stage", pa.string(), optional=True),  # where it is, or where it ended
+            _column("flow_run_id", pa.string(), optional=True),  # the orchestrator's
+            _column("worker", pa.string(), optional=True),  # machine and process
+            _column("error_class", pa.string(), optional=True),
+            _column("error_message", pa.string(), optional=True),
+            _column("at", pa.timestamp("us", tz="UTC")),  # by the writer's clock: for people, not for ordering
+            _column("wall_s", pa.float64(), optional=True),  # of the attempt so far
+            _column("cpu_s", pa.float64(), optional=True),
+        ]
+    ),
+    choices={"state": ATTEMPT_STATES},
+    redacted=("error_message",),
+)
+
 _STAGES = TableSchema(
     name="stages",
-    version=1,
+    version=2,
     columns=pa.schema(
         [
             _column("video_id", pa.string()),
@@ -88,10 +142,14 @@ _STAGES = TableSchema(
             _column("peak_rss_mb", pa.float64(), optional=True),
             _column("knobs", pa.string(), optional=True),  # JSON
             _column("accuracy", pa.string(), optional=True),  # JSON
+            _column("attempt_number", pa.int32()),  # of the video, as in `attempts`
+            _column("seq", pa.int32()),  # orders the rows of one run, whatever the clocks say
         ]
     ),
+    upgrades={1: _with_order},
     choices={"state": STATES},
     json=("knobs", "accuracy"),
+    redacted=("reason", "error_message"),
 )
 
 _FRAMES = TableSchema(
@@ -138,4 +196,24 @@ _METRICS = TableSchema(
     ),
 )
 
-TABLES: Mapping[str, TableSchema] = {schema.name: schema for schema in (_STAGES, _FRAMES, _METRICS)}
+_EFFECTS = TableSchema(
+    name="effects",
+    version=1,
+    columns=pa.schema(
+        [
+            _column("video_id", pa.string()),
+            _column("key", pa.string()),  # of the artifact that was planned
+            _column("scene", pa.string()),
+            _column("effect", pa.string()),
+            _column("enabled", pa.bool_()),
+            _column("reason", pa.string()),  # what in the scene, the motion or the camera decided it
+            _column("predicted_s", pa.float64(), optional=True),  # CPU seconds a frame
+            _column("measured_s", pa.float64(), optional=True),
+        ]
+    ),
+    redacted=("reason",),
+)
+
+TABLES: Mapping[str, TableSchema] = {
+    schema.name: schema for schema in (_VIDEOS, _ATTEMPTS, _STAGES, _FRAMES, _METRICS, _EFFECTS)
+}

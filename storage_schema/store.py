@@ -6,6 +6,7 @@ Layout, all of it readable by a person:
     artifacts/<stage>/<key>/attempts/<attempt>/<file>  blobs, under a path unique to the attempt
     leases/<key>/0001.json                             who is at work on a key
     tables/<table>/batch=<batch>/<file>.parquet        see storage_schema.tables
+    batches/<batch>/manifest.json                      see storage_schema.batches
     scratch/                                           attempts in progress, where the store is on this machine
 """
 
@@ -15,7 +16,6 @@ import errno
 import logging
 import shutil
 import tempfile
-import time
 import uuid
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
@@ -25,7 +25,8 @@ from platformdirs import user_cache_path
 
 from storage_schema.artifacts import ARTIFACTS, Blob
 from storage_schema.attempt import Attempt
-from storage_schema.backend import SCRATCH, Backend, newest, open_backend
+from storage_schema.backend import SCRATCH, Backend, open_backend
+from storage_schema.collect import collect
 from storage_schema.errors import ArtifactError, CorruptError
 from storage_schema.keys import check_stage, file_sha256
 from storage_schema.lease import Lease
@@ -79,7 +80,7 @@ class ArtifactStore:
         """
         check_name(key, "key")
         for name in [stage] if stage is not None else self.backend.names("artifacts"):
-            if (manifest := self._newest_whole(name, key, self._generations(name, key), verify)) is not None:
+            if (manifest := self._newest_whole(name, key, self.generations(name, key), verify)) is not None:
                 return manifest
         return None
 
@@ -144,26 +145,17 @@ class ArtifactStore:
         check_name(key, "key")
         return Lease(self.backend, key, owner, ttl_s, wait_s)
 
-    def gc(self, older_than_s: float) -> list[str]:
-        """Delete what killed attempts and repaired artifacts left.
+    def gc(self, older_than_s: float, *, dry_run: bool = False) -> list[str]:
+        """Delete what killed attempts, repairs and merges left (`storage_schema.collect`).
 
         Args:
             older_than_s: only what was last written longer ago than this; more than the longest stage takes.
+            dry_run: only say what would be deleted.
 
         Returns:
             Paths that were deleted, relative to the root of the store, sorted.
         """
-        limit = time.time() - older_than_s
-        removed = []
-        for stage in self.backend.names("artifacts"):
-            for key in self.backend.names(f"artifacts/{stage}"):
-                removed += self._gc_key(stage, key, limit)
-        for name in self.backend.names(SCRATCH):
-            path = f"{SCRATCH}/{name}"
-            if newest(self.backend, [path, *self.backend.files(path)]) <= limit:
-                self.backend.remove(path)
-                removed.append(path)
-        return sorted(removed)
+        return [orphan.path for orphan in collect(self, older_than_s, dry_run=dry_run)]
 
     def publish(self, manifest: Manifest) -> Manifest:
         """Write a manifest under its key unless a whole one is there; what `Attempt.commit` ends with.
@@ -174,24 +166,32 @@ class ArtifactStore:
         stage, key, data = manifest.stage, manifest.key, manifest.to_json()
         while True:
             # One listing for both questions: a number seen only by the second could be that of a whole manifest.
-            generations = self._generations(stage, key)
+            generations = self.generations(stage, key)
             if (winner := self._newest_whole(stage, key, generations, verify=True)) is not None:
                 _LOG.info("%s %s was committed by attempt %s first", stage, key[:12], winner.attempt)
                 return winner
             # All of them are damaged, so ours is next. If somebody takes it meanwhile, look again.
-            if self.backend.create(f"{_folder(stage, key)}/{manifest_name(max(generations, default=0) + 1)}", data):
+            if self.backend.create(manifest_path(stage, key, max(generations, default=0) + 1), data):
                 return manifest
 
     def attempt_folder(self, stage: str, key: str, attempt: str) -> str:
         """Where an attempt's blobs lie, relative to the root of the store."""
         return f"{_folder(stage, key)}/attempts/{attempt}"
 
-    def _generations(self, stage: str, key: str) -> list[int]:
+    def generations(self, stage: str, key: str) -> list[int]:
+        """Numbers of the manifests under a key, ascending; the newest whole one counts."""
         numbers = (generation_of(name) for name in self.backend.names(_folder(stage, key)))
         return sorted(number for number in numbers if number is not None)
 
-    def _read(self, stage: str, key: str, generation: int) -> Manifest:
-        manifest = Manifest.from_json(self.backend.read(f"{_folder(stage, key)}/{manifest_name(generation)}"))
+    def read_manifest(self, stage: str, key: str, generation: int) -> Manifest:
+        """One manifest, unverified.
+
+        Raises:
+            CorruptError: not a whole manifest of this key.
+            StoreVersionError: a newer version of this software wrote it.
+            FileNotFoundError: there is none of that number.
+        """
+        manifest = Manifest.from_json(self.backend.read(manifest_path(stage, key, generation)))
         if (manifest.stage, manifest.key) != (stage, key):
             raise CorruptError(f"manifest is of {manifest.stage} {manifest.key}")
         return manifest
@@ -201,20 +201,29 @@ class ArtifactStore:
         return next((manifest for manifest in found if manifest is not None), None)
 
     def _whole(self, stage: str, key: str, generation: int, verify: bool) -> Manifest | None:
+        found = self.inspect(stage, key, generation, verify=verify)
+        if isinstance(found, Manifest):
+            return found
+        _LOG.warning("%s %s (manifest %d) does not count: %s", stage, key[:12], generation, found)
+        return None
+
+    def inspect(self, stage: str, key: str, generation: int, *, verify: bool = True) -> Manifest | str:
+        """A manifest whose outputs are whole, or the reason why it does not count.
+
+        Raises:
+            StoreVersionError: a newer version of this software wrote it.
+        """
         try:
-            manifest = self._read(stage, key, generation)
+            manifest = self.read_manifest(stage, key, generation)
             for blob in manifest.blobs:
                 self._verify(blob, verify)
         except (CorruptError, FileNotFoundError, IsADirectoryError) as error:
-            reason = f"{error.filename} is missing" if isinstance(error, OSError) and error.filename else str(error)
+            return f"{error.filename} is missing" if isinstance(error, OSError) and error.filename else str(error)
         except OSError as error:
             if error.errno != errno.EIO:
                 raise
-            reason = f"{error.filename} cannot be read"
-        else:
-            return manifest
-        _LOG.warning("%s %s (manifest %d) does not count: %s", stage, key[:12], generation, reason)
-        return None
+            return f"{error.filename} cannot be read"
+        return manifest
 
     def _verify(self, blob: BlobRef, content: bool) -> None:
         if (size := self.backend.size(blob.path)) != blob.size:
@@ -233,28 +242,11 @@ class ArtifactStore:
                 raise CorruptError(f"{self.url}/{blob.path} has other bytes than were committed; look the key up again")
             shutil.move(part, target)
 
-    def _gc_key(self, stage: str, key: str, limit: float) -> list[str]:
-        folder = f"{_folder(stage, key)}/attempts"
-        attempts = self.backend.names(folder)
-        if not attempts:
-            return []
-        # Read after the attempts were listed, so that one that commits meanwhile is seen.
-        needed = set()
-        for generation in reversed(self._generations(stage, key)):
-            try:
-                needed.add(self._read(stage, key, generation).attempt)
-            except (CorruptError, FileNotFoundError):
-                continue
-            # Older generations were found damaged when this one was written.
-            break
-        removed = []
-        for attempt in attempts:
-            path = f"{folder}/{attempt}"
-            if attempt not in needed and newest(self.backend, self.backend.files(path)) <= limit:
-                self.backend.remove(path)
-                removed.append(path)
-        return removed
-
 
 def _folder(stage: str, key: str) -> str:
     return f"artifacts/{stage}/{key}"
+
+
+def manifest_path(stage: str, key: str, generation: int) -> str:
+    """Where a manifest lies, relative to the root of the store."""
+    return f"{_folder(stage, key)}/{manifest_name(generation)}"

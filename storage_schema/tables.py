@@ -1,46 +1,39 @@
-"""Parquet tables in the store: the ledger of stages, frames and metrics, partitioned by batch.
+"""Parquet tables in the store: the ledger of stages and attempts, frames, metrics and more, partitioned by batch.
 
 A file is written whole, once, under a name of its own, so that any number of workers append without knowing of each
-other. Compacting writes one file that lists those it stands for; from then on readers ignore them, whether they have
-been deleted yet or not.
+other. Now and then an append puts small files together (`storage_schema.partition`), so that reading stays quick
+however many there were.
 """
 
 from __future__ import annotations
 
-import io
+import hashlib
 import logging
 import uuid
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from storage_schema.errors import CorruptError, StoreError
-from storage_schema.keys import canonical_json
+from storage_schema.errors import StoreError
 from storage_schema.manifest import check_name
+from storage_schema.part_cache import PartCache
+from storage_schema.partition import Partition, partition_folder
+from storage_schema.rows import rows_to_table, to_parquet
 from storage_schema.schemas import TABLES, TableSchema
 from storage_schema.store import ArtifactStore
 
 __all__ = ["TABLES", "TableSchema", "Tables"]
 
 _LOG = logging.getLogger(__name__)
-_VERSION, _TABLE, _PARTS = b"ahoy.schema_version", b"ahoy.table", b"ahoy.parts"
 _PARTITION = "batch="
-# Files vanish under a reader only while somebody compacts; one compaction changes the listing a handful of times.
-_READ_TRIES = 20
-
-
-@dataclass(frozen=True)
-class _Part:
-    """One Parquet file: its rows at the current version, and the appended files that its rows came from."""
-
-    name: str
-    sources: frozenset[str]
-    rows: pa.Table
+# A reader opens at most about this many small files, at one to two milliseconds each.
+MERGE_FROM = 128
+# Listing a folder costs too much to be done at every append: about one in so many looks.
+LOOK_EVERY = 32
+_MERGE_LEASE_S = 60.0
 
 
 class Tables:
@@ -55,6 +48,7 @@ class Tables:
         self._backend = store.backend
         self._store = store
         self._schemas = schemas
+        self._cache = PartCache()
 
     def append(self, table: str, rows: Iterable[Mapping[str, Any]], *, batch: str) -> str:
         """Add rows as one new file; either all of them are there afterwards or none.
@@ -75,13 +69,17 @@ class Tables:
         """
         schema = self._schema(table)
         check_name(batch, "batch")
-        data = _rows_to_table(schema, rows, batch)
+        data = rows_to_table(schema, rows, batch)
         name = _new_name()
-        path = f"{_folder(table, batch)}/{name}"
-        self._backend.write(path, _to_parquet(schema, data, [name]))
+        path = f"{partition_folder(table, batch)}/{name}"
+        self._backend.write(path, to_parquet(schema, data))
+        if int(name[-16:-8], 16) % LOOK_EVERY == 0:
+            self._tidy(table, batch)
         return path
 
-    def read(self, table: str, batch: str | None = None, filters: Any = None) -> pa.Table:
+    def read(
+        self, table: str, batch: str | None = None, filters: Any = None, columns: Sequence[str] | None = None
+    ) -> pa.Table:
         """All rows, with the current columns and `batch` as the first.
 
         Args:
@@ -89,6 +87,7 @@ class Tables:
             batch: only this one; None for all.
             filters: what `pyarrow.parquet.read_table` takes: an expression, or tuples such as ("stage", "==",
                 "ingest").
+            columns: only these, in this order; filters may name others.
 
         Returns:
             The rows, files in the order in which they were written.
@@ -98,17 +97,19 @@ class Tables:
             StoreVersionError: a file was written by a newer version of this software.
             CorruptError: a file is not what was written; the message names it.
         """
-        schema = self._schema(table)
-        tables = [_with_batch(schema.columns.empty_table(), "")]
+        # A filter may be about any column.
+        wanted = tuple(name for name in columns or () if name != "batch") if filters is None else ()
+        empty = self._schema(table).columns.empty_table()
+        tables = [_with_batch(empty.select(list(wanted)) if wanted else empty, "")]
         for name in [batch] if batch is not None else self.batches(table):
-            check_name(name, "batch")
-            for part in self._parts(schema, name):
-                tables.append(_with_batch(part.rows, name))
+            parts = self._partition(table, name).snapshot(wanted).parts
+            tables += [_with_batch(part.rows, name) for part in parts.values()]
         rows = pa.concat_tables(tables)
-        if filters is None:
-            return rows
-        expression = filters if isinstance(filters, pa.compute.Expression) else pq.filters_to_expression(filters)
-        return rows.filter(expression)
+        if filters is not None:
+            rows = rows.filter(
+                filters if isinstance(filters, pa.compute.Expression) else pq.filters_to_expression(filters)
+            )
+        return rows if columns is None else rows.select(list(columns))
 
     def batches(self, table: str) -> list[str]:
         """Names of the batches that have rows in a table, sorted."""
@@ -116,7 +117,7 @@ class Tables:
         return [name.removeprefix(_PARTITION) for name in names if name.startswith(_PARTITION)]
 
     def compact(self, table: str, batch: str) -> int:
-        """Put all files of a batch into one of the current version. Readers and writers may go on meanwhile.
+        """Put small files of a batch together. Readers and writers may go on meanwhile; appending does it by itself.
 
         Returns:
             How many files were replaced; 0 if there was nothing to do.
@@ -124,138 +125,51 @@ class Tables:
         Raises:
             StoreVersionError: a file was written by a newer version of this software; nothing is changed.
         """
-        schema = self._schema(table)
-        check_name(batch, "batch")
-        folder = _folder(table, batch)
-        parts = self._parts(schema, batch)
-        old = self._files(folder)
-        if len(parts) > 1:
-            sources = sorted(set().union(*(part.sources for part in parts)))
-            rows = pa.concat_tables([part.rows for part in parts])
-            self._backend.write(f"{folder}/{_new_name()}", _to_parquet(schema, rows, sources))
-        live = {part.name for part in self._parts(schema, batch)}
-        done = [name for name in old if name not in live]
-        for name in done:
-            self._backend.remove(f"{folder}/{name}")
-        return len(done)
+        return self._partition(table, batch).merge()
+
+    def upgrade(self, table: str, batch: str) -> int:
+        """Rewrite a batch's rows if some of its files are of an older version of the table.
+
+        Returns:
+            How many files were replaced; 0 if all are of the current version.
+
+        Raises:
+            CorruptError, StoreVersionError: a file cannot be read; nothing is changed.
+        """
+        return self._partition(table, batch).merge(everything=True) if self.is_outdated(table, batch) else 0
+
+    def is_outdated(self, table: str, batch: str) -> bool:
+        """Whether some of a batch's files are of an older version of the table."""
+        partition = self._partition(table, batch)
+        return any(part.version != partition.schema.version for part in partition.snapshot().parts.values())
 
     def _schema(self, table: str) -> TableSchema:
         if table not in self._schemas:
             raise ValueError(f"table {table!r}: expected one of {sorted(self._schemas)}")
         return self._schemas[table]
 
-    def _files(self, folder: str) -> list[str]:
-        """Files of a partition, listed until two listings agree: one taken while files change can miss some."""
-        names = self._backend.names(folder)
-        while (again := self._backend.names(folder)) != names:
-            names = again
-        return [name for name in names if name.endswith(".parquet")]
+    def _partition(self, table: str, batch: str) -> Partition:
+        schema = self._schema(table)
+        check_name(batch, "batch")
+        return Partition(self._backend, schema, batch, self._cache)
 
-    def _parts(self, schema: TableSchema, batch: str) -> list[_Part]:
-        """The files of a partition that count, in the order of their names."""
-        folder = _folder(schema.name, batch)
-        for _ in range(_READ_TRIES):
-            try:
-                parts = [self._part(schema, folder, name) for name in self._files(folder)]
-            except FileNotFoundError:
-                continue
-            return _live(parts, folder)
-        raise StoreError(f"{folder} kept changing while it was read; read it again once nobody compacts it")
-
-    def _part(self, schema: TableSchema, folder: str, name: str) -> _Part:
+    def _tidy(self, table: str, batch: str) -> None:
+        """Merge if there are many files, unless somebody else is at it. What goes wrong here is no fault of a row's."""
+        partition = self._partition(table, batch)
+        key = f"merge-{hashlib.sha256(partition.folder.encode()).hexdigest()}"
         try:
-            rows = pq.read_table(io.BytesIO(self._backend.read(f"{folder}/{name}")))
-            metadata = rows.schema.metadata or {}
-            version, table = int(metadata[_VERSION]), metadata[_TABLE].decode("utf-8")
-            sources = frozenset(metadata[_PARTS].decode("utf-8").split("\n"))
-        except (pa.ArrowException, KeyError, ValueError) as error:
-            raise CorruptError(f"{folder}/{name} is not a table of this store ({error}); move it away") from error
-        if table != schema.name:
-            raise CorruptError(f"{folder}/{name} holds rows of table {table}, not {schema.name}; move it away")
-        return _Part(name, sources, schema.upgraded(rows.replace_schema_metadata(), version))
-
-
-def _live(parts: Sequence[_Part], folder: str) -> list[_Part]:
-    """Drop the files that another one stands for; of two that stand for the same, the later counts."""
-    # Only a compacted file can stand for others, and there are few.
-    compacted = [part for part in parts if part.sources != {part.name}]
-
-    def replaced(part: _Part) -> bool:
-        return any(
-            part.sources < other.sources or (part.sources == other.sources and part.name < other.name)
-            for other in compacted
-        )
-
-    live = [part for part in parts if not replaced(part)]
-    if sum(len(part.sources) for part in live) != len(frozenset().union(*(part.sources for part in live))):
-        names = [part.name for part in live]
-        raise CorruptError(f"{folder}: some of the files {names} hold the same rows; move the copies away")
-    return live
+            if len(partition.appended()) < MERGE_FROM:
+                return
+            with self._store.lease(key, owner="append", ttl_s=_MERGE_LEASE_S) as held:
+                if held:
+                    partition.merge()
+        except (OSError, StoreError) as error:
+            _LOG.warning("%s could not be merged: %s", partition.folder, error)
 
 
 def _with_batch(rows: pa.Table, batch: str) -> pa.Table:
     names = pa.array([batch] * rows.num_rows, pa.string())
     return rows.add_column(0, pa.field("batch", pa.string(), nullable=False), names)
-
-
-def _rows_to_table(schema: TableSchema, rows: Iterable[Mapping[str, Any]], batch: str) -> pa.Table:
-    plain = []
-    for i, row in enumerate(rows):
-        where = f"{schema.name} row {i}"
-        if unknown := set(row) - set(schema.columns.names) - {"batch"}:
-            raise ValueError(f"{where}: unknown columns {sorted(unknown)}, expected {schema.columns.names}")
-        if row.get("batch", batch) != batch:
-            raise ValueError(f"{where}: batch {row['batch']!r} is appended to batch {batch!r}")
-        plain.append({column.name: _value(schema, column, row.get(column.name), where) for column in schema.columns})
-    arrays = []
-    for column in schema.columns:
-        try:
-            arrays.append(pa.array([row[column.name] for row in plain], column.type))
-        except (pa.ArrowException, TypeError, OverflowError) as error:
-            raise ValueError(f"{schema.name}.{column.name}: expected {column.type} ({error})") from error
-    return pa.Table.from_arrays(arrays, schema=schema.columns)
-
-
-def _value(schema: TableSchema, column: pa.Field, value: Any, where: str) -> Any:
-    where = f"{where}, {column.name}"
-    if value is None:
-        if not column.nullable:
-            raise ValueError(f"{where}: expected {column.type}, got nothing; this column is not optional")
-        return None
-    choices = schema.choices.get(column.name)
-    if choices is not None and value not in choices:
-        raise ValueError(f"{where}: expected one of {choices}, got {value!r}")
-    if column.name in schema.json:
-        return canonical_json(value, where).decode("utf-8")
-    if pa.types.is_timestamp(column.type):
-        return _time(value, where)
-    if pa.types.is_list(column.type) or pa.types.is_fixed_size_list(column.type):
-        return np.asarray(value, dtype=np.float32).reshape(-1)
-    if isinstance(value, np.generic):
-        return value.item()
-    return value
-
-
-def _time(value: Any, where: str) -> datetime:
-    time = datetime.fromisoformat(value) if isinstance(value, str) else value
-    if not isinstance(time, datetime) or time.tzinfo is None:
-        raise ValueError(f"{where}: expected a time with its offset from UTC, got {value!r}; use datetime.now(UTC)")
-    return time.astimezone(UTC)
-
-
-def _to_parquet(schema: TableSchema, rows: pa.Table, sources: Sequence[str]) -> bytes:
-    metadata = {
-        _VERSION: str(schema.version).encode("ascii"),
-        _TABLE: schema.name.encode("utf-8"),
-        _PARTS: "\n".join(sources).encode("utf-8"),
-    }
-    buffer = io.BytesIO()
-    pq.write_table(rows.replace_schema_metadata(metadata), buffer, compression="zstd")
-    return buffer.getvalue()
-
-
-def _folder(table: str, batch: str) -> str:
-    return f"tables/{table}/{_PARTITION}{batch}"
 
 
 def _new_name() -> str:

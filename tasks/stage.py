@@ -8,8 +8,9 @@ stage gets keys, leases, verification, the ledger and its bill the same way, wit
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -139,7 +140,10 @@ class Source:
 class Run:
     """One attempt at one video: where its artifacts and rows go, who watches, and which body is used.
 
-    The body is a name or the path of a file; keys know it by its contents alone, so it is no knob of a stage.
+    Attributes:
+        body: a name or the path of a file; keys know it by its contents alone, so it is no knob of a stage.
+        attempt_number: of the video in its batch, from 1.
+        sequence: numbers the rows of this run, so that their order does not rest on a clock.
     """
 
     store: ArtifactStore
@@ -149,6 +153,8 @@ class Run:
     run_id: str
     observer: Observer
     body: str = PACKAGED
+    attempt_number: int = 1
+    sequence: Iterator[int] = field(default_factory=itertools.count)
 
 
 def run_stage(stage: Stage, config: BaseModel, inputs: Mapping[str, StageRef | Source], run: Run) -> StageRef:
@@ -284,6 +290,8 @@ def _row(
         "cpu_s": bill.cpu_s,
         "peak_rss_mb": bill.peak_rss_mb,
         "knobs": config.model_dump(mode="json") if config is not None else None,
+        "attempt_number": run.attempt_number,
+        "seq": next(run.sequence),
     }
 
 

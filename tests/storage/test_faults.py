@@ -19,7 +19,8 @@ import pytest
 from fsspec import register_implementation
 from fsspec.implementations.memory import MemoryFileSystem
 
-from storage_schema.errors import StoreFullError, is_full
+from storage_schema.batches import BatchEntry, BatchManifest, list_batches, read_batch, submit
+from storage_schema.errors import StoreFullError, StoreUnavailableError, is_full
 from storage_schema.store import ArtifactStore
 from storage_schema.tables import Tables
 
@@ -104,11 +105,24 @@ def test_a_kill_between_any_two_steps_of_an_append_or_a_compaction_loses_and_dou
         assert frames in ([0, 1, 2], [0, 1, 2, 3, 4])
         tables.compact("frames", "b")
         assert tables.read("frames", "b")["frame"].to_pylist() == frames
-        assert len(tables._backend.names("tables/frames/batch=b")) == 1
+        assert len(tables._partition("frames", "b").snapshot().parts) == 1
         if code == DONE:
             assert step >= 8
             return
     pytest.fail("the compaction never finished")
+
+
+def test_a_kill_between_any_two_steps_of_a_submit_leaves_no_batch_or_all_of_it(tmp_path: Path) -> None:
+    batch = BatchManifest.of("b", [BatchEntry(f"v{i}", f"v{i}.mp4") for i in range(5)])
+    for step in range(100):
+        store = open_store(tmp_path / str(step))
+        code = in_child(lambda: submit(store, batch), step)  # noqa: B023
+        submit(store, batch)
+        assert read_batch(store, "b") == batch and list_batches(store) == ["b"]
+        if code == DONE:
+            assert step >= 4
+            return
+    pytest.fail("the submit never finished")
 
 
 def test_everything_is_flushed_to_the_disk_before_the_manifest_appears(
@@ -195,7 +209,7 @@ def test_a_connection_that_breaks_at_any_step_leaves_nothing_or_everything(tmp_p
         try:
             commit(store, 1.0)
             broke = Failing.left < 0
-        except ConnectionError:
+        except StoreUnavailableError:
             broke = True
         finally:
             Failing.left = None

@@ -191,6 +191,49 @@ def test_a_damaged_lease_stops_nobody(store: ArtifactStore) -> None:
         assert held
 
 
+def foreign(store: ArtifactStore, ahead_s: float, ttl_s: float, number: int = 1) -> None:
+    """The lease of another machine, whose clock is ahead by so much."""
+    expires_at = time.time() + ahead_s + ttl_s
+    holder = {"owner": "far", "token": "t", "expires_at": expires_at, "ttl_s": ttl_s, "host": "another-machine"}
+    store.backend.write(f"leases/{KEY}/{number:04d}.json", json.dumps(holder).encode())
+
+
+def test_a_dead_holder_whose_clock_was_ahead_is_found_out_by_watching(store: ArtifactStore) -> None:
+    foreign(store, ahead_s=86_400, ttl_s=0.2)
+    with store.lease(KEY, "impatient", 60) as held:
+        assert not held
+    with store.lease(KEY, "patient", 60, wait_s=30) as held:
+        assert held
+
+
+def test_a_live_holder_whose_clock_is_behind_keeps_its_lease(store: ArtifactStore) -> None:
+    stop = threading.Event()
+
+    def renew() -> None:
+        number = 1
+        while not stop.is_set():
+            foreign(store, ahead_s=-120, ttl_s=5.0, number=number)
+            stop.wait(0.1)
+            number += 1
+            store.backend.remove(f"leases/{KEY}/{number - 2:04d}.json")
+
+    holder = threading.Thread(target=renew)
+    foreign(store, ahead_s=-120, ttl_s=5.0)
+    holder.start()
+    try:
+        with store.lease(KEY, "me", 60, wait_s=0.6) as held:
+            assert not held, "by its dates it was over two minutes ago"
+    finally:
+        stop.set()
+        holder.join()
+
+
+def test_a_lease_that_no_clock_error_explains_is_over_at_once(store: ArtifactStore) -> None:
+    foreign(store, ahead_s=-3600, ttl_s=60.0)
+    with store.lease(KEY, "me", 60) as held:
+        assert held
+
+
 @pytest.mark.parametrize(("ttl", "wait"), [(0, 0), (-1, 0), (float("nan"), 0), (1, -1)])
 def test_bad_times_of_a_lease_are_refused(store: ArtifactStore, ttl: float, wait: float) -> None:
     with pytest.raises(ValueError, match="ttl_s > 0"):

@@ -150,6 +150,14 @@ def test_a_refused_commit_publishes_nothing_and_can_be_put_right(store: Artifact
     assert store.lookup(KEY) is not None
 
 
+def test_secrets_in_a_summary_do_not_reach_the_manifest(store: ArtifactStore) -> None:
+    with written(store) as attempt:
+        source = "https://me:hunter2@host/v.mp4?v=1&sig=hunter2"
+        manifest = attempt.commit(stage_version=1, config=CONFIG, inputs={}, summary={"source": source})
+    assert "hunter2" not in manifest.to_json().decode() and "host/v.mp4?v=1" in manifest.summary["source"]
+    assert store.lookup(KEY) == manifest
+
+
 @pytest.mark.parametrize("key", ["", "..", "a/b", "/abs", "a\\b", ".hidden", "a\0b", "x" * 200, "é"])
 def test_keys_that_could_leave_their_folder_are_refused(store: ArtifactStore, key: str) -> None:
     for use in (store.lookup, lambda key: store.attempt(key, "toy"), lambda key: store.lease(key, "me", 1.0)):
