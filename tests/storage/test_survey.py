@@ -16,7 +16,7 @@ from flows.cli import app
 from storage_schema import batches, manifest, migrate, survey
 from storage_schema.batches import BatchEntry, BatchManifest, read_batch, submit
 from storage_schema.manifest import SCHEMA_VERSION, manifest_name
-from storage_schema.repair import repair
+from storage_schema.repair import _disjoint, repair
 from storage_schema.schemas import TABLES
 from storage_schema.store import ArtifactStore
 from storage_schema.survey import Finding
@@ -134,6 +134,12 @@ def test_an_index_is_made_anew_from_the_files_that_hold_what_was_merged_though_o
     half(store, f"{FOLDER}/index/{partition.head():06d}.json")
     repair(store, survey.survey(store).findings)
     assert sorted(frames(store)) == list(range(8))
+
+
+def test_files_that_share_an_append_are_never_put_in_force_together() -> None:
+    sources = {"x": frozenset("ab"), "y": frozenset("c"), "z": frozenset("bc")}
+    assert _disjoint(sources, frozenset()) == ("x", "y"), "x and z cover as much, and b twice"
+    assert _disjoint(sources, frozenset("a")) in (("x", "y"), ("z",)), "a is still there as its own file"
 
 
 def test_what_a_newer_version_wrote_is_found_and_left_alone(store: ArtifactStore) -> None:
