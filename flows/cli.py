@@ -5,14 +5,14 @@ from __future__ import annotations
 import logging
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from pydantic import ValidationError
 from rich.console import Console
 from rich.markup import escape
 
-from flows import models_cli, plan_cli, store_cli
+from flows import batch_cli, models_cli, plan_cli, server_cli, store_cli
 from storage_schema.secrets import RedactSecrets
 
 if TYPE_CHECKING:
@@ -21,7 +21,12 @@ if TYPE_CHECKING:
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 app.add_typer(models_cli.app, name="models")
 app.add_typer(store_cli.app, name="store")
-app.command("plan")(plan_cli.plan)
+COMMANDS = (
+    *(batch_cli.submit, batch_cli.status, batch_cli.rerun, batch_cli.cancel, batch_cli.logs, plan_cli.plan),
+    *(server_cli.server, server_cli.worker, server_cli.install),
+)
+for command in COMMANDS:
+    app.command()(command)
 
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
@@ -98,14 +103,15 @@ def _run_here(request: VideoRequest, console: Console) -> dict[str, Path]:
     settings = request.settings()
     source = request.source()
     with TerminalObserver(console) as observer:
-        attempt = request.run(source, observer)
+        attempt = request.run(request.id_of(source), observer)
         outcome = process(source, settings, attempt, only=request.stages)
     for stage, reason in outcome.skipped.items():
         console.print(f"{stage:<10} skipped: {reason}")
-    return deliver(outcome, attempt, request.out)
+    return deliver(outcome, attempt, request.out) if request.out else {}
 
 
 def _run_flow(request: VideoRequest) -> dict[str, Path]:
     from flows.process_video import process_video
 
-    return {name: Path(path) for name, path in process_video(request).items()}
+    made: Any = process_video(request)
+    return {name: Path(path) for name, path in made.items()}

@@ -7,20 +7,33 @@ from __future__ import annotations
 
 import base64
 import contextlib
+import re
 import time
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 from uuid import UUID
 
 import cv2
-from prefect.artifacts import create_markdown_artifact, create_progress_artifact, update_progress_artifact
+from prefect.artifacts import (
+    create_link_artifact,
+    create_markdown_artifact,
+    create_progress_artifact,
+    create_table_artifact,
+    update_progress_artifact,
+)
 from prefect.exceptions import MissingContextError
 from prefect.logging import get_run_logger
 
 from ahoy_core.formats.images import read_png
-from tasks.stage import StageRef
+from flows.pipeline import Outcome
+from storage_schema.manifest import Manifest
+from tasks.stage import Run, StageRef
 
 UPDATE_S = 2.0  # an API call per frame would cost more than the frame
 PICTURE_WIDTH = 640
+OVERVIEW = (("perceive", "overlay.png"), ("animate", "turntable.png"))
+LINKS = (("report", "report.html"), ("animate", "avatar.ply"), ("animate", "turntable.mp4"))
 
 
 class PrefectObserver:
@@ -55,8 +68,71 @@ class PrefectObserver:
             f"**{ref.stage}**: {ref.state}, {bill.wall_s:.1f} s, {bill.cpu_s:.1f} s CPU, {bill.peak_rss_mb:.0f} MB",
             f"artifact `{ref.key[:16]}`",
         ]
-        lines += [f"![{path.name}](data:image/jpeg;base64,{_thumbnail(path)})" for path in sorted(folder.glob("*.png"))]
+        lines += [_inline(path) for path in sorted(folder.glob("*.png"))]
         create_markdown_artifact("\n\n".join(lines), key=f"stage-{ref.stage}", description=f"what {ref.stage} made")
+
+    def summary(self, outcome: Outcome, run: Run) -> None:
+        """Publish the run as a whole: time per stage and what was skipped, scores, pictures, where things are."""
+        manifests = {
+            name: manifest
+            for name, ref in outcome.refs.items()
+            if (manifest := run.store.lookup(ref.key, stage=name, verify=False)) is not None
+        }
+        create_table_artifact(
+            _stage_rows(outcome), key="time-per-stage", description="what ran, for how long; what was skipped, and why"
+        )
+        if scores := _scores(manifests):
+            create_table_artifact(scores, key="scores", description="what the stages say of their results")
+        if pictures := _overview(manifests, run):
+            create_markdown_artifact(
+                pictures, key="overview", description="the body on the video, and the avatar from all sides"
+            )
+        for stage, name in LINKS:
+            for blob in manifests[stage].blobs if stage in manifests else ():
+                if blob.name == name:
+                    link = f"{run.store.url}/{blob.path}"
+                    create_link_artifact(link, link_text=name, key=_key(name), description=f"{name} in the store")
+
+
+def _stage_rows(outcome: Outcome) -> list[dict[str, Any]]:
+    rows = [
+        {
+            "stage": name,
+            "state": "found in the store" if ref.state == "cached" else "made now",
+            "wall s": round(ref.bill.wall_s, 2),
+            "CPU s": round(ref.bill.cpu_s, 2),
+            "peak MB": round(ref.bill.peak_rss_mb),
+            "why": "",
+        }
+        for name, ref in outcome.refs.items()
+    ]
+    blank = {"wall s": "", "CPU s": "", "peak MB": ""}
+    return rows + [{"stage": name, "state": "skipped", **blank, "why": why} for name, why in outcome.skipped.items()]
+
+
+def _scores(manifests: Mapping[str, Manifest]) -> list[dict[str, Any]]:
+    return [
+        {"stage": stage, "what": name.replace("_", " "), "value": str(value)}
+        for stage, manifest in manifests.items()
+        for name, value in manifest.summary.get("facts", {}).items()
+    ]
+
+
+def _overview(manifests: Mapping[str, Manifest], run: Run) -> str:
+    shown = [
+        (stage, name) for stage, name in OVERVIEW if stage in manifests and name in manifests[stage].summary["pictures"]
+    ]
+    paths = [run.store.fetch(manifests[stage], name) for stage, name in shown]
+    return "\n\n".join(_inline(path) for path in paths)
+
+
+def _inline(path: Path) -> str:
+    return f"![{path.name}](data:image/jpeg;base64,{_thumbnail(path)})"
+
+
+def _key(name: str) -> str:
+    """Artifact keys are lower-case letters, digits and dashes."""
+    return re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")
 
 
 def _thumbnail(path: Path) -> str:

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import os
 import uuid
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import platformdirs
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from storage_schema.artifacts import ARTIFACTS, Blob
 from storage_schema.store import ArtifactStore
 from storage_schema.tables import Tables
 from tasks.presets import PRESETS
 from tasks.settings import Preset, Settings
 from tasks.sources import fetch_source, policy_from_environment
 from tasks.stage import Observer, Run, Source
+
+_NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]*$"
 
 
 class VideoRequest(BaseModel):
@@ -23,7 +27,7 @@ class VideoRequest(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     video: str = Field(description="path or address of a video (http, https, YouTube, s3, ...)")
-    out: str = Field(description="folder for the avatar, the videos and the report")
+    out: str | None = Field(None, description="folder for the avatar, the videos and the report; by default none")
     store: str | None = Field(None, description="URL of the artifact store; by default OUT/store")
     preset: Preset = Field("standard", description="how much time to spend")
     subject: int | None = Field(None, ge=0, description="which person, counted from the most visible; by default 0")
@@ -31,7 +35,16 @@ class VideoRequest(BaseModel):
     end_s: float | None = Field(None, gt=0, description="moment at which using stops; by default the end")
     stages: tuple[str, ...] | None = Field(None, description="only these stages and what they need; by default all")
     overrides: tuple[str, ...] = Field((), description="knobs, as STAGE.KNOB=VALUE")
-    batch: str = Field("local", pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", description="name the rows are filed under")
+    batch: str = Field("local", pattern=_NAME, description="name the rows are filed under")
+    video_id: str | None = Field(None, pattern=_NAME, description="the video's id in its batch; by default one is made")
+    attempt: int = Field(1, ge=1, description="which try at the video this is")
+    stage_timeout_s: float = Field(7200.0, gt=0, description="seconds that one stage may take")
+
+    @model_validator(mode="after")
+    def _goes_somewhere(self) -> VideoRequest:
+        if self.out is None and self.store is None:
+            raise ValueError("expected a folder (out) or a store for the results, got neither; give one of them")
+        return self
 
     def settings(self) -> Settings:
         """Return the preset with the subject, the time span and the overrides applied."""
@@ -49,11 +62,28 @@ class VideoRequest(BaseModel):
         video = str(Path(self.video).expanduser()) if self.video.startswith("~") else self.video
         return fetch_source(video, policy_from_environment(), source_cache())
 
-    def run(self, source: Source, observer: Observer) -> Run:
-        """Open the store and name this attempt."""
-        store = ArtifactStore(self.store or Path(self.out) / "store")
-        video_id = f"{source.name}-{source.content_hash[:8]}"
-        return Run(store, Tables(store), self.batch, video_id, uuid.uuid4().hex[:12], observer, self.settings().body)
+    def open_store(self, artifacts: Mapping[str, Sequence[Blob]] = ARTIFACTS) -> ArtifactStore:
+        """Open the store that the results go to."""
+        return ArtifactStore(self.store or Path(self.out or ".") / "store", artifacts=artifacts)
+
+    def id_of(self, source: Source) -> str:
+        """Return the video's id: the one asked for, or one made of the file's name and content."""
+        return self.video_id or f"{source.name}-{source.content_hash[:8]}"
+
+    def run(self, video_id: str, observer: Observer, store: ArtifactStore | None = None) -> Run:
+        """Name this attempt; its results go to `store`, opened here unless given."""
+        store = store or self.open_store()
+        run_id = uuid.uuid4().hex[:12]
+        return Run(
+            store,
+            Tables(store),
+            self.batch,
+            video_id,
+            run_id,
+            observer,
+            self.settings().body,
+            attempt_number=self.attempt,
+        )
 
 
 def source_cache() -> Path:

@@ -11,7 +11,7 @@ import dataclasses
 import itertools
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -91,6 +91,8 @@ class Stage:
         needs: names of the inputs; an upstream stage, or `source` for the video itself.
         run: writes the files that `storage_schema.artifacts.ARTIFACTS[name]` declares into `ctx.out`.
         roles: who fills which role under a configuration.
+        slots: names of scarce resources (`gpu`, `download`) that making it takes one slot each of, under a
+            configuration; a stage that is found in the store takes none.
     """
 
     name: str
@@ -99,6 +101,7 @@ class Stage:
     needs: tuple[str, ...]
     run: Callable[[Any, StageContext], StageOutput]
     roles: Callable[[Any], Mapping[str, Role]] = lambda config: {}
+    slots: Callable[[Any], Sequence[str]] = lambda config: ()
 
 
 @dataclass(frozen=True)
@@ -142,6 +145,7 @@ class Run:
 
     Attributes:
         body: a name or the path of a file; keys know it by its contents alone, so it is no knob of a stage.
+        take_slots: waits for one slot of each named resource and holds them while its block runs.
         attempt_number: of the video in its batch, from 1.
         sequence: numbers the rows of this run, so that their order does not rest on a clock.
     """
@@ -153,6 +157,7 @@ class Run:
     run_id: str
     observer: Observer
     body: str = PACKAGED
+    take_slots: Callable[[Sequence[str]], AbstractContextManager[Any]] = lambda names: nullcontext()
     attempt_number: int = 1
     sequence: Iterator[int] = field(default_factory=itertools.count)
 
@@ -189,7 +194,9 @@ def run_stage(stage: Stage, config: BaseModel, inputs: Mapping[str, StageRef | S
             manifest = run.store.lookup(key, stage=stage.name)  # whoever held the lease may just have made it
             if manifest is None:
                 state = "done"
-                manifest = _make(stage, config, inputs, run, key, hashes, roles, started)
+                # The lease first: whoever holds a slot never waits for a lease, so nobody waits in a circle.
+                with run.take_slots(stage.slots(config)):
+                    manifest = _make(stage, config, inputs, run, key, hashes, roles, started)
     ref = StageRef(stage.name, key, manifest.content_hash, state, Bill(**manifest.summary["bill"]))
     if state == "cached":
         run.tables.append("stages", [_row(run, stage, config, key, "cached", started, Bill())], batch=run.batch)

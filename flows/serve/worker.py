@@ -1,0 +1,97 @@
+"""`ahoy worker`: Prefect's process worker, whose runs start from a nursery instead of from nothing."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, nullcontext, suppress
+from pathlib import Path
+from typing import Any
+
+from prefect.utilities.processutils import command_to_string
+from prefect.workers.process import ProcessJobConfiguration, ProcessWorker
+
+from flows.serve import nursery, relay
+from flows.serve.errors import ServerError
+
+FEEDERS = 4  # batches that one worker feeds at a time, beside its videos: feeding is light
+_SOCKET = "AHOY_NURSERY"
+
+
+class WarmJobConfiguration(ProcessJobConfiguration):
+    """A process job whose command is the relay, unless the pool names a command of its own."""
+
+    def prepare_for_flow_run(self, *arguments: Any, **named: Any) -> None:
+        """Fill in what depends on the run."""
+        if self.command is None and _SOCKET in os.environ:
+            self.command = command_to_string([sys.executable, "-I", "-S", relay.__file__, os.environ[_SOCKET]])
+            self.stream_output = False  # runs write to the worker's own output; a pipe would break when it dies
+        super().prepare_for_flow_run(*arguments, **named)
+
+
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore")  # Prefect remarks that this replaces its own process worker, which is meant
+
+    class WarmWorker(ProcessWorker):
+        """A process worker with warm starts."""
+
+        type = "process"
+        job_configuration = WarmJobConfiguration
+
+
+@contextmanager
+def running_nursery() -> Iterator[None]:
+    """Start the nursery and name its socket in the environment; one that is named there already is shared.
+
+    Raises:
+        ServerError: it did not come up.
+    """
+    if _SOCKET in os.environ:
+        yield
+        return
+    folder = Path(tempfile.mkdtemp(prefix="ahoy-worker-"))
+    path = folder / "socket"
+    command = [sys.executable, "-m", nursery.__name__, str(path)]
+    # A session of its own: what is meant for the worker (Ctrl-C, a group's SIGTERM) must not reach runs by the side.
+    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True)
+    assert process.stdin is not None and process.stdout is not None
+    try:
+        if process.stdout.readline() != nursery.READY:
+            raise ServerError(f"the nursery of this worker did not start (exit status {process.wait()}); see above")
+        os.environ[_SOCKET] = str(path)
+        yield
+    finally:
+        os.environ.pop(_SOCKET, None)
+        process.stdin.close()
+        process.wait()
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def work(pools: Mapping[str, int], name: str | None) -> None:
+    """Take runs until interrupted (SIGINT or SIGTERM); runs at work are then told to stop.
+
+    Args:
+        pools: name of a work pool -> how many of its runs at a time.
+        name: of the worker in Prefect's pages; by default the machine's and the process's.
+    """
+    warm = hasattr(os, "fork") and sys.platform != "darwin"  # macOS's own libraries do not survive a fork
+    with running_nursery() if warm else nullcontext():
+        asyncio.run(_work(pools, name or f"{socket.gethostname()}-{os.getpid()}"))
+
+
+async def _work(pools: Mapping[str, int], name: str) -> None:
+    workers = [WarmWorker(work_pool_name=pool, limit=limit, name=name) for pool, limit in pools.items()]
+    task = asyncio.gather(*(worker.start() for worker in workers))
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, task.cancel)
+    with suppress(asyncio.CancelledError):
+        await task
