@@ -20,6 +20,16 @@ from ahoy_core.body.convert import from_local_ref
 from ahoy_core.body.packaged import PackagedBody
 from ahoy_core.conventions import Cameras
 
+# The captures' 24 joints (SMPL's order) and the joint of the packaged body at the same place; `breast.L` and spine01
+# start where spine3 is.
+JOINTS24 = {
+    "pelvis": "root", "l_hip": "upperleg01.L", "r_hip": "upperleg01.R", "spine1": "spine04", "l_knee": "lowerleg01.L",
+    "r_knee": "lowerleg01.R", "spine2": "spine02", "l_ankle": "foot.L", "r_ankle": "foot.R", "spine3": "breast.L",
+    "l_foot": "toe1-1.L", "r_foot": "toe1-1.R", "neck": "neck01", "l_collar": "clavicle.L", "r_collar": "clavicle.R",
+    "head": "head", "l_shoulder": "upperarm01.L", "r_shoulder": "upperarm01.R", "l_elbow": "lowerarm01.L",
+    "r_elbow": "lowerarm01.R", "l_wrist": "wrist.L", "r_wrist": "wrist.R", "l_hand": "finger3-1.L", "r_hand": "finger3-1.R",
+}  # fmt: skip
+
 
 @dataclass(frozen=True)
 class Capture:

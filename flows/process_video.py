@@ -16,6 +16,7 @@ from flows.deliver import deliver
 from flows.pipeline import process
 from flows.prefect_observer import PrefectObserver
 from flows.request import VideoRequest
+from flows.subjects import for_subject, list_people
 from tasks.settings import Settings
 from tasks.sources import source_name
 from tasks.stage import Run, Source, Stage, StageRef, run_stage
@@ -44,5 +45,13 @@ def process_video(request: VideoRequest) -> dict[str, str]:
     """Turn one video into an avatar; returns the paths of what it made."""
     source = request.source()
     run = request.run(source, PrefectObserver())
-    outcome = process(source, request.settings(), run, only=request.stages, call=call_as_task)
-    return {name: str(path) for name, path in deliver(outcome, run, request.out).items()}
+    settings = request.settings()
+    if request.subject != "all":
+        outcome = process(source, settings, run, only=request.stages, call=call_as_task)
+        return {name: str(path) for name, path in deliver(outcome, run, request.out).items()}
+    made: dict[str, str] = {}
+    for number in list_people(source, settings, run, call_as_task).worthwhile:
+        chosen, own = for_subject(settings, run, number)
+        outcome = process(source, chosen, own, only=request.stages, call=call_as_task)
+        made |= {f"person{number}/{name}": str(path) for name, path in deliver(outcome, own, request.out).items()}
+    return made
