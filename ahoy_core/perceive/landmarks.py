@@ -71,6 +71,7 @@ class Reading:
     roi: Roi
 
     def next_roi(self) -> Roi:
+        """The crop for the next frame, as the network steers it."""
         return roi_from_points(self.points[HIPS, :2], self.points[CIRCLE, :2])
 
 

@@ -151,7 +151,7 @@ class Networks:
         """Run the face network on one upright crop, [192,192,3] sRGB in [0,1].
 
         Returns:
-            Landmarks [468,3] in crop pixels (z negative towards the camera), and the score in [0,1] that a face is there.
+            Landmarks [468,3] in crop pixels (z negative towards the camera), and a score in [0,1]: a face is there.
         """
         points, score = sorted(self._face(image).values(), key=lambda values: -values.size)
         return points.reshape(N_FACE, 3), float(sigmoid(score.reshape(-1))[0])

@@ -90,9 +90,11 @@ def perceive(
     for row, t in enumerate(looked.tolist()):
         roi = track.rois[row]
         if roi is not None:
-            soft[t] = refine(frames[t], track.mask(row, height, width), roi.size)
+            mask = track.mask(row, height, width)
+            soft[t] = refine(frames[t], mask, roi.size) if config.mask_refinement else np.round(255 * mask)
         report(BAR_LANDMARKS + (BAR_MASKS - BAR_LANDMARKS) * (row + 1) // len(looked), BAR, "cutting the person out")
-    soft[used] = hold_static(frames[used], soft[used], shots[used])
+    if config.mask_refinement:
+        soft[used] = hold_static(frames[used], soft[used], shots[used])
     seen = observations(track, pts[looked], shots[looked], intrinsics, viewmat, config)
     knobs = FitConfig(iterations=config.iterations, smoothing=config.smoothing, outline=config.outline)
     fit = fit_body(

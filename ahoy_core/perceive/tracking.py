@@ -76,7 +76,7 @@ Looks = Sequence[Sequence[NDArray[np.float32]]]
 
 
 def link(detections: list[list[Detection]], shot: np.ndarray, looks: Looks | None = None) -> list[Track]:
-    """Link detections into people: within a shot by place and appearance, across cuts by appearance; most prominent first.
+    """Link detections into people, most prominent first: in a shot by place and looks, across cuts by looks alone.
 
     Args:
         detections: by frame.
@@ -172,7 +172,8 @@ def choose(tracks: list[Track], shot: np.ndarray, subject: int | None) -> Track:
         )
     if not 0 <= (subject or 0) < len(tracks):
         raise NoPersonError(
-            f"expected a subject from 0 to {len(tracks) - 1}, got {subject}; `ahoy run VIDEO --list-subjects` shows them"
+            f"expected a subject from 0 to {len(tracks) - 1}, got {subject}; "
+            "`ahoy run VIDEO --list-subjects` shows them"
         )
     return tracks[subject or 0]
 

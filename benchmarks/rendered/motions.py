@@ -17,7 +17,8 @@ KINDS = ("stand", "step", "reach", "wave", "bend", "squat", "turn", "lunge", "ra
 X, Y, Z = np.eye(3)
 # Degrees that everybody's joints wander by, and where they wander about.
 IDLE: Mapping[str, tuple[float, float]] = {
-    "arm_out": (11, 7), "arm_forward": (3, 12), "arm_twist": (0, 18), "elbow": (22, 16), "wrist": (0, 12), "curl": (25, 12),
+    "arm_out": (11, 7), "arm_forward": (3, 12), "arm_twist": (0, 18), "elbow": (22, 16), "wrist": (0, 12),
+    "curl": (25, 12),
     "hip_out": (2, 4), "hip_turn": (6, 6), "hip_flex": (2, 3), "knee": (4, 4),
 }  # fmt: skip
 MIDDLE: Mapping[str, tuple[float, float]] = {

@@ -25,8 +25,16 @@ LIFT = 2e-3  # metres that shadow rays start off the surface
 
 @dataclass(frozen=True)
 class View:
-    """A camera and a light: viewmat [4,4] world -> camera, K [3,3], picture size, rays a pixel's side, light [3] (unit,
-    towards it, world), share of light that is everywhere.
+    """A camera and a light.
+
+    Attributes:
+        viewmat: [4,4] world -> camera.
+        K: [3,3] pixels.
+        height: of the picture.
+        width: of the picture.
+        fine: rays along a pixel's side.
+        light: [3] unit vector towards the light, world.
+        ambient: share of the light that comes from everywhere.
     """
 
     viewmat: FloatArray
@@ -80,7 +88,7 @@ def render(people: list[tuple[Person, list[FloatArray]]], boxes: list[Box], view
     mine = [i for i, number in enumerate(owner) if number == subject]
     alone = _join([parts[i] for i in mine], view)
     rays = _rays(view)
-    hit, bary, alpha = _first_hits(whole, rays)
+    hit, bary, _ = _first_hits(whole, rays)
     rgb = _shade(whole, view, hit, bary, rays)
     visible = (hit >= 0) & np.isin(whole.skin[np.maximum(hit, 0)], mine)
     amodal = _first_hits(alone, rays)[0] >= 0
