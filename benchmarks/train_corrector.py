@@ -90,7 +90,7 @@ def _read_like_a_clip(networks: Networks, image: NDArray[np.uint8]) -> tuple[NDA
     return points[:, :2], world, np.mean([r.visibility for r in both], axis=0)[:33]
 
 
-def train(out: Path, files: list[Path], log: Path | None, seed: int = 0) -> None:
+def train(out: Path, files: list[Path], log: Path | None, steps: int, seed: int = 0) -> None:
     """Train on most people, report on the others, write the weights.
 
     The straight part is a ridge regression, its spreads one of the logarithms of what it misses in people left out; the
@@ -112,7 +112,7 @@ def train(out: Path, files: list[Path], log: Path | None, seed: int = 0) -> None
     lines[-1] |= {"stage": "straight", "nll": _likelihood(network, fresh), **_report(network, fresh)}
     print(json.dumps(lines[-1]), flush=True)
     straight = {name: value.clone() for name, value in network.state_dict().items()}
-    _bend(network, known)
+    _bend(network, known, steps)
     lines.append({"stage": "bent", "nll": _likelihood(network, fresh), **_report(network, fresh)})
     print(json.dumps(lines[-1]), flush=True)
     if lines[1]["nll"] > lines[0]["nll"]:
@@ -185,12 +185,12 @@ def _apply(solution: tuple[Tensor, Tensor], inputs: Tensor) -> Tensor:
     return inputs @ solution[0] + solution[1]
 
 
-def _bend(network: Corrector, known: dict[str, Any]) -> None:
+def _bend(network: Corrector, known: dict[str, Any], steps: int) -> None:
     """Train the bent part, the straight one held."""
     network.train()
     optimiser = torch.optim.AdamW(network.bent.parameters(), RATE, weight_decay=DECAY)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, RATE, STEPS)
-    for _ in range(STEPS):
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, RATE, max(steps, 1))
+    for _ in range(steps):
         batch = _augmented(known, torch.randint(len(known["up"]), (BATCH,)))
         loss = _nll(network(batch["features"]), batch["to_points"], batch["to_world"])
         optimiser.zero_grad()
@@ -285,13 +285,14 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("inputs", type=Path, nargs="+")
     parser.add_argument("--json", type=Path, default=None)
+    parser.add_argument("--steps", type=int, default=STEPS, help="of training the bent part; 0: a straight map")
     arguments = parser.parse_args()
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     torch.set_num_threads(1)
     if arguments.what == "read":
         read(arguments.out, arguments.inputs[0], load_networks())
     else:
-        train(arguments.out, arguments.inputs, arguments.json)
+        train(arguments.out, arguments.inputs, arguments.json, arguments.steps)
 
 
 if __name__ == "__main__":

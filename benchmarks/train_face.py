@@ -3,6 +3,8 @@
     python -m benchmarks.train_face read FACES.npz --assets MAKEHUMAN --count 800
     python -m benchmarks.train_face train OUT.safetensors FACES.npz --json LOG
 
+    python -m benchmarks.train_face golden tests/perceive/faces.npz --assets MAKEHUMAN --count 24 --seed 77
+
 Skill is measured on people left out of the training, one after the other.
 """
 
@@ -108,6 +110,21 @@ def read(out: Path, assets: Path, count: int, seed: int, networks: Networks) -> 
     print(f"{len(points)} of {count} faces read", flush=True)
 
 
+def write_golden(out: Path, assets: Path, count: int, seed: int) -> None:
+    """Render heads for the tests: pictures, body landmarks and actions, of people that training never sees."""
+    body, rng = load_packaged_body(), np.random.default_rng(seed)
+    wardrobe, person = Wardrobe(assets, body), None
+    pictures, landmarks, actions = [], [], []
+    for i in range(count):
+        person = wardrobe.dress(rng) if person is None or i % PER_PERSON == 0 else person
+        actions.append(sample_expression(rng, body.expression_names))
+        image, marks = draw_head(rng, body, person, actions[-1])
+        pictures.append(cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 90])[1].ravel())
+        landmarks.append(marks)
+    sizes = np.array([len(picture) for picture in pictures])
+    np.savez(out, jpeg=np.concatenate(pictures), sizes=sizes, landmarks=np.stack(landmarks), actions=np.stack(actions))
+
+
 def train(out: Path, files: list[Path], log: Path | None) -> None:
     """Fit the reference and the ridge regression, and write both with the skill on people left out."""
     data = [np.load(path) for path in files]
@@ -177,7 +194,7 @@ def _solve(rows: NDArray[np.float64], actions: NDArray[np.float64], ridge: float
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("read", "train"))
+    parser.add_argument("what", choices=("read", "train", "golden"))
     parser.add_argument("out", type=Path)
     parser.add_argument("inputs", type=Path, nargs="*")
     parser.add_argument("--assets", type=Path, help="folder of MakeHuman's CC0 clothes and hair")
@@ -189,6 +206,8 @@ def main() -> None:
     torch.set_num_threads(1)
     if arguments.what == "read":
         read(arguments.out, arguments.assets, arguments.count, arguments.seed, load_networks())
+    elif arguments.what == "golden":
+        write_golden(arguments.out, arguments.assets, arguments.count, arguments.seed)
     else:
         train(arguments.out, arguments.inputs, arguments.json)
 

@@ -5,12 +5,15 @@ from __future__ import annotations
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
 from ahoy_core.perceive.detection import Detection
 
+COLOURS = (78, 178)  # of 256, range of the two colour axes that is told apart
 BINS = (4, 8, 8)  # of lightness and of the two colour axes: light changes more than colour
 HALF_WIDTH = 0.35  # of a patch, in lengths of the torso
 CHEST, THIGHS = (0.15, 0.95), (-0.7, -0.1)  # from the hips (0) to the shoulders (1)
+SOFTEN = 0.7  # bins: a little more or less light must not make another person
 PATCH = 16  # samples a side
 HIPS, SHOULDERS = 0, 2  # of a detection's points
 
@@ -48,5 +51,7 @@ def _patch(
 
 def _histogram(patch: NDArray[np.uint8]) -> NDArray[np.float32]:
     lab = cv2.cvtColor(patch, cv2.COLOR_RGB2LAB)
-    # Clothes' colours lie in the middle of the two axes' range.
-    return cv2.calcHist([lab], [0, 1, 2], None, list(BINS), [0, 256, 78, 178, 78, 178]).ravel()
+    # Most clothes' colours lie in the middle of the two axes' range; the others count at its ends.
+    lab[..., 1:] = np.clip(lab[..., 1:], COLOURS[0], COLOURS[1] - 1)
+    counts = cv2.calcHist([lab], [0, 1, 2], None, list(BINS), [0, 256, *COLOURS, *COLOURS])
+    return np.asarray(gaussian_filter(counts, SOFTEN, mode="constant"), np.float32).ravel()

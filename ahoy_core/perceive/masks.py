@@ -17,7 +17,6 @@ GUIDE_EPS = 1e-3  # colour variance (RGB in [0,1]) below which a patch counts as
 SOFT_LOW, SOFT_HIGH = 0.2, 0.85  # mask values that become 0 and 1: the network's edge is wider than the picture's
 EDGE = 0.5 * (SOFT_LOW + SOFT_HIGH) * 255  # of 255: the soft mask's value where the alpha is a half
 REACH = 0.12  # of the body's height: what lies farther from the fitted body is not this person
-CLOTHES = 0.008  # of the body's height that clothes stand off the skin
 SUPERSAMPLING = 2
 MIN_DEPTH = 1e-3  # metres: nearer points count as behind the camera
 VISIBLE = 127  # of 255: more than half
@@ -29,7 +28,7 @@ class FrameMasks:
 
     Attributes:
         visible: [H,W] uint8 alpha of the visible part.
-        amodal: [H,W] uint8 the whole person, hidden parts included: the body grown to clothes, and what is visible.
+        amodal: [H,W] uint8 the whole person, hidden parts included: the body, and what is visible.
         box: [4] float32, x0, y0, x1, y1 of the visible part in pixels; zeros where nothing is visible.
         occluded: share in [0,1] of the silhouette inside the picture that is not visible.
     """
@@ -52,17 +51,7 @@ def frame_masks(soft: NDArray[np.uint8], silhouette: NDArray[np.uint8]) -> Frame
     visible = np.round(alpha * 255).astype(np.uint8)
     body, seen = silhouette > VISIBLE, visible > VISIBLE
     occluded = 1.0 - float((body & seen).sum()) / max(int(body.sum()), 1) if body.any() else 0.0
-    return FrameMasks(visible, np.maximum(dressed(silhouette), visible), mask_box(visible), occluded)
-
-
-def dressed(silhouette: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Grow a naked silhouette [H,W] by what clothes and hair stand off, `CLOTHES` of its height."""
-    box = mask_box(silhouette)
-    away = CLOTHES * float(max(box[3] - box[1], box[2] - box[0]))
-    if away <= 0:
-        return silhouette
-    outside = cv2.distanceTransform((silhouette <= VISIBLE).astype(np.uint8), cv2.DIST_L2, 5)
-    return np.maximum(silhouette, np.round(255 * np.clip(away + 1.0 - outside, 0, 1)).astype(np.uint8))
+    return FrameMasks(visible, np.maximum(silhouette, visible), mask_box(visible), occluded)
 
 
 def refine(frame: NDArray[np.uint8], soft: NDArray[np.float32], crop_size: float) -> NDArray[np.uint8]:

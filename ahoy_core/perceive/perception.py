@@ -37,8 +37,8 @@ class Perception:
         K: [3,3] pixels.
         landmarks: [T,33,3] x, y in pixels and visibility in [0,1].
         visible: [T,H,W] uint8 alpha of the visible part of the person.
-        amodal: [T,H,W] uint8, the whole person, hidden parts included: silhouette of the fitted body, grown to
-            clothes, and what is visible; in unused frames too.
+        amodal: [T,H,W] uint8, the whole person, hidden parts included: silhouette of the fitted body, and
+            what is visible; in unused frames too.
         head: [T,H,W] uint8 alpha of the visible head with its hair.
         occluded: [T] share of the body's silhouette inside the picture that is not visible.
         box: [T,4] x0, y0, x1, y1 of the visible part; zeros where unused.

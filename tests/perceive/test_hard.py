@@ -12,7 +12,7 @@ from ahoy_core.body.packaged import PackagedBody
 from ahoy_core.conventions import OBSERVED_VIEWMAT
 from ahoy_core.perceive.fit import Fit, fit_body
 from ahoy_core.perceive.head import head_mask
-from ahoy_core.perceive.masks import dressed, frame_masks, mask_box
+from ahoy_core.perceive.masks import frame_masks, mask_box
 from ahoy_core.perceive.networks import Networks
 from ahoy_core.perceive.objective import FitConfig
 from ahoy_core.perceive.perceive import NoPersonError, PerceiveConfig, perceive
@@ -125,7 +125,6 @@ def test_masks_of_one_pixel_and_of_none_are_borne(body: PackagedBody, pixels: in
     assert finite(fit) and float(errors(body, scene, fit).max()) < 0.02
     soft = frame_masks(masks[0], masks[0])
     assert soft.amodal.max() <= 255 and np.isfinite(soft.occluded) and mask_box(soft.visible).shape == (4,)
-    assert dressed(np.zeros((4, 4), np.uint8)).max() == 0
 
 
 def test_a_head_out_of_view_has_no_mask_and_a_hand_before_the_face_is_none_of_it(body: PackagedBody) -> None:
