@@ -111,19 +111,17 @@ def train(out: Path, files: list[Path], log: Path | None, steps: int, seed: int 
     lines = [{"pictures": len(known["up"]), "held_out": len(fresh["up"]), "ridge": _straight(network, known, fresh)}]
     lines[-1] |= {"stage": "straight", "nll": _likelihood(network, fresh), **_report(network, fresh)}
     print(json.dumps(lines[-1]), flush=True)
-    straight = {name: value.clone() for name, value in network.state_dict().items()}
-    _bend(network, known, steps)
-    lines.append({"stage": "bent", "nll": _likelihood(network, fresh), **_report(network, fresh)})
-    print(json.dumps(lines[-1]), flush=True)
-    if lines[1]["nll"] > lines[0]["nll"]:
-        network.load_state_dict(straight)
+    kept = "straight"
+    if steps > 0:
+        straight = {name: value.clone() for name, value in network.state_dict().items()}
+        _bend(network, known, steps)
+        lines.append({"stage": "bent", "nll": _likelihood(network, fresh), **_report(network, fresh)})
+        print(json.dumps(lines[-1]), flush=True)
+        kept = "bent" if lines[1]["nll"] <= lines[0]["nll"] else "straight"
+        if kept == "straight":
+            network.load_state_dict(straight)
     _calibrate(network, fresh)
-    lines.append(
-        {
-            "kept": "bent" if lines[1]["nll"] <= lines[0]["nll"] else "straight",
-            "scales": network.calibration.exp().tolist(),
-        }
-    )
+    lines.append({"kept": kept, "scales": network.calibration.exp().tolist()})
     print(json.dumps(lines[-1]), flush=True)
     save_file({name: value.half().contiguous() for name, value in network.state_dict().items()}, str(out))
     if log:
