@@ -35,11 +35,14 @@ def observations(
     if config.corrector:
         up = None if viewmat is None else np.asarray(viewmat)[:3, 2]
         better = correct(points, world, track.visibility[found], K, up)
-        points, world = better.points, better.world
-        weights, world_weights = (
+        # What is seen the network places better than the corrector does; what is hidden, worse.
+        share = visible.numpy()[..., None]
+        points, world = share * points + (1 - share) * better.points, better.world
+        trust, world_weights = (
             torch.from_numpy(best / np.maximum(spread, best)) ** 2
             for best, spread in ((BEST_IMAGE, better.image_spread), (BEST_WORLD, better.world_spread))
         )
+        weights = torch.maximum(visible, trust)
     return Observations(
         points=torch.from_numpy(points.astype(np.float64)),
         weights=weights,
