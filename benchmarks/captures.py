@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import av
@@ -19,6 +19,17 @@ from numpy.typing import NDArray
 from ahoy_core.body.convert import from_local_ref
 from ahoy_core.body.packaged import PackagedBody
 from ahoy_core.conventions import Cameras
+
+# The captures' 24 joints (SMPL's order) and the joint of the packaged body at the same place; `breast.L` and spine01
+# start where spine3 is.
+JOINTS24 = {
+    "pelvis": "root", "l_hip": "upperleg01.L", "r_hip": "upperleg01.R", "spine1": "spine04", "l_knee": "lowerleg01.L",
+    "r_knee": "lowerleg01.R", "spine2": "spine02", "l_ankle": "foot.L", "r_ankle": "foot.R", "spine3": "breast.L",
+    "l_foot": "toe1-1.L", "r_foot": "toe1-1.R", "neck": "neck01", "l_collar": "clavicle.L", "r_collar": "clavicle.R",
+    "head": "head", "l_shoulder": "upperarm01.L", "r_shoulder": "upperarm01.R", "l_elbow": "lowerarm01.L",
+    "r_elbow": "lowerarm01.R",
+    "l_wrist": "wrist.L", "r_wrist": "wrist.R", "l_hand": "finger3-1.L", "r_hand": "finger3-1.R",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -36,6 +47,10 @@ class Capture:
     frames: NDArray[np.uint8]
     visible: NDArray[np.uint8]
     cameras: Mapping[str, Cameras]
+
+    def first(self, count: int) -> Capture:
+        """The same capture, cut off after `count` frames."""
+        return replace(self, frames=self.frames[:count], visible=self.visible[:count])
 
     def scored_frames(self) -> list[int]:
         """Numbers of the frames with a true picture from the front camera, in order."""

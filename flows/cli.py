@@ -11,12 +11,15 @@ import typer
 from pydantic import ValidationError
 from rich.console import Console
 from rich.markup import escape
+from rich.table import Table
 
 from flows import batch_cli, models_cli, plan_cli, server_cli, store_cli
 from storage_schema.secrets import RedactSecrets
 
 if TYPE_CHECKING:
     from flows.request import VideoRequest
+    from tasks.settings import Settings
+    from tasks.stage import Run, Source
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 app.add_typer(models_cli.app, name="models")
@@ -50,7 +53,12 @@ def run(
     video: Annotated[str, typer.Argument(help="a video: a path or an address")],
     out: Annotated[Path, typer.Option(help="folder for the avatar, the videos and the report")],
     preset: Annotated[str, typer.Option(help="draft, standard or high: how much time to spend")] = "standard",
-    subject: Annotated[int | None, typer.Option(help="which person, 0 for the most visible")] = None,
+    subject: Annotated[
+        str | None, typer.Option(help="which person, 0 for the most visible, or all: one avatar each")
+    ] = None,
+    list_subjects: Annotated[
+        bool, typer.Option("--list-subjects", help="only show who is in the video, on a sheet in OUT/<video>/")
+    ] = False,
     stages: Annotated[str | None, typer.Option(help="only these, comma-separated, and what they need")] = None,
     store: Annotated[str | None, typer.Option(help="URL of the artifact store  [default: OUT/store]")] = None,
     set_: Annotated[
@@ -71,12 +79,15 @@ def run(
                 "out": str(out),
                 "store": store,
                 "preset": preset,
-                "subject": subject,
+                "subject": int(subject) if subject and subject.isdigit() else subject,
                 "stages": tuple(stages.split(",")) if stages else None,
                 "overrides": tuple(set_ or ()),
             }
         )
-        paths = _run_flow(request) if prefect else _run_here(request, console)
+        if list_subjects:
+            paths = _list_here(request, console)
+        else:
+            paths = _run_flow(request) if prefect else _run_here(request, console)
     except KeyboardInterrupt:
         console.print("interrupted; finished stages are kept, the same command goes on from there")
         raise typer.Exit(EXIT_INTERRUPTED) from None
@@ -98,16 +109,38 @@ def _complain(console: Console, message: str) -> None:
 def _run_here(request: VideoRequest, console: Console) -> dict[str, Path]:
     from flows.deliver import deliver
     from flows.pipeline import process
+    from flows.subjects import each_subject
     from flows.terminal import TerminalObserver
 
     settings = request.settings()
     source = request.source()
+    paths: dict[str, Path] = {}
     with TerminalObserver(console) as observer:
         attempt = request.run(request.id_of(source), observer)
-        outcome = process(source, settings, attempt, only=request.stages)
-    for stage, reason in outcome.skipped.items():
-        console.print(f"{stage:<10} skipped: {reason}")
-    return deliver(outcome, attempt, request.out) if request.out else {}
+        for prefix, chosen, run in each_subject(request.subject, source, settings, attempt):
+            outcome = process(source, chosen, run, only=request.stages)
+            for stage, reason in outcome.skipped.items():
+                console.print(f"{stage:<10} skipped: {reason}")
+            made = deliver(outcome, run, request.out) if request.out else {}
+            paths |= {prefix + name: path for name, path in made.items()}
+    return paths
+
+
+def _list_here(request: VideoRequest, console: Console) -> dict[str, Path]:
+    from flows.subjects import deliver_sheet, list_people
+    from flows.terminal import TerminalObserver
+
+    source = request.source()
+    with TerminalObserver(console) as observer:
+        attempt = request.run(request.id_of(source), observer)
+        people = list_people(source, request.settings(), attempt)
+    table = Table("subject", "frames", "first", "last", "shots", "size in pixels", "prominence")
+    for row in people.subjects:
+        shots, worth = ", ".join(map(str, row["shots"])), f"{row['worth']:.0%}"
+        cells = (row["number"], row["frames"], row["first"], row["last"], shots, round(row["size"]), worth)
+        table.add_row(*map(str, cells))
+    console.print(table)
+    return {"subjects.png": deliver_sheet(people, Path(request.out or ".") / attempt.video_id)}
 
 
 def _run_flow(request: VideoRequest) -> dict[str, Path]:

@@ -25,6 +25,7 @@ from flows.deliver import deliver
 from flows.pipeline import process
 from flows.prefect_observer import PrefectObserver
 from flows.request import VideoRequest
+from flows.subjects import each_subject
 from storage_schema.artifacts import ARTIFACTS, Blob
 from storage_schema.batches import is_cancelled
 from tasks.errors import is_transient
@@ -124,9 +125,12 @@ def run_video(
     call.rows = rows = AttemptRows(run, flow_run.id)
     try:
         source = source or call.source(request)
-        outcome = process(source, request.settings(), run, only=request.stages, call=call, stages=stages)
-        paths = deliver(outcome, run, request.out) if request.out else {}
-        observer.summary(outcome, run)
+        paths: dict[str, str] = {}
+        for prefix, settings, own in each_subject(request.subject, source, request.settings(), run, call):
+            outcome = process(source, settings, own, only=request.stages, call=call, stages=stages)
+            made = deliver(outcome, own, request.out) if request.out else {}
+            paths |= {prefix + name: str(path) for name, path in made.items()}
+            observer.summary(outcome, own)
     except BatchCancelledError as error:
         rows.ended("cancelled", call.stage, error)
         return Cancelled(message=str(error))
@@ -137,7 +141,7 @@ def run_video(
         rows.ended("cancelled" if is_cancelled(run.store, run.batch) else "crashed", call.stage, error)
         raise
     rows.ended("done", call.stage)
-    return {name: str(path) for name, path in paths.items()}
+    return paths
 
 
 def as_flow(stages: Sequence[Stage], artifacts: Mapping[str, Sequence[Blob]]) -> Flow[[VideoRequest], Any]:

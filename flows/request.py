@@ -6,6 +6,7 @@ import os
 import uuid
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Annotated, Literal
 
 import platformdirs
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -30,7 +31,9 @@ class VideoRequest(BaseModel):
     out: str | None = Field(None, description="folder for the avatar, the videos and the report; by default none")
     store: str | None = Field(None, description="URL of the artifact store; by default OUT/store")
     preset: Preset = Field("standard", description="how much time to spend")
-    subject: int | None = Field(None, ge=0, description="which person, counted from the most visible; by default 0")
+    subject: Annotated[int, Field(ge=0)] | Literal["all"] | None = Field(
+        None, description="which person, counted from the most visible, or all: one avatar each; by default 0"
+    )
     start_s: float | None = Field(None, ge=0, description="first moment used, in seconds; by default the beginning")
     end_s: float | None = Field(None, gt=0, description="moment at which using stops; by default the end")
     stages: tuple[str, ...] | None = Field(None, description="only these stages and what they need; by default all")
@@ -48,7 +51,8 @@ class VideoRequest(BaseModel):
 
     def settings(self) -> Settings:
         """Return the preset with the subject, the time span and the overrides applied."""
-        named = {"perceive.subject": self.subject, "ingest.start_s": self.start_s, "ingest.end_s": self.end_s}
+        who = self.subject if isinstance(self.subject, int) else None
+        named = {"perceive.subject": who, "ingest.start_s": self.start_s, "ingest.end_s": self.end_s}
         said = [f"{knob}={value!r}" for knob, value in named.items() if value is not None]
         return PRESETS[self.preset].with_overrides((*said, *self.overrides))
 

@@ -62,12 +62,18 @@ ARTIFACTS: Mapping[str, tuple[Blob, ...]] = {
             "masks.npz",
             {
                 "visible": Array("uint8", ("T", "H", "W")),  # alpha of the visible part of the subject, 0..255
-                "amodal": Array("uint8", ("T", "H", "W")),  # silhouette of the fitted body
+                "amodal": Array("uint8", ("T", "H", "W")),  # the whole person, hidden parts included
+                "head": Array("uint8", ("T", "H", "W")),  # alpha of the visible head with its hair
+                "occluded": Array("float32", ("T",)),  # share of the body's silhouette that is not visible
                 "box": Array("float32", ("T", 4)),  # x0, y0, x1, y1 of the visible mask, pixels; zeros where unused
             },
         ),
         Blob("overlay.png"),  # body, landmarks and mask drawn on frames
         Blob("fit.json"),  # field of view and where it came from, final residuals, what was skipped and why
+    ),
+    "subjects": (
+        Blob("subjects.png"),  # a row of pictures for each person
+        Blob("subjects.json"),  # number, frames, shots, size of each; which are worth an avatar
     ),
     "texture": (
         Blob(

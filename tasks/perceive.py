@@ -17,10 +17,10 @@ from ahoy_core.perceive.networks import REQUIRED, Networks
 from ahoy_core.perceive.overlay import contact_sheet
 from ahoy_core.perceive.perceive import PerceiveConfig, Perception, perceive
 from tasks.model_files import model_path
-from tasks.roles import networks, packaged_body
+from tasks.roles import networks, ours, packaged, packaged_body
 from tasks.stage import Role, Stage, StageContext, StageOutput
 
-MASKS = ("visible", "amodal", "box")
+MASKS = ("visible", "amodal", "head", "occluded", "box")
 
 
 def run_perceive(config: PerceiveConfig, ctx: StageContext) -> StageOutput:
@@ -44,6 +44,7 @@ def _summary(found: Perception) -> dict[str, Any]:
         "frames with the subject": f"{notes['frames_used']} of {notes['frames']}",
         "hidden share of the body": f"{notes['occluded_mean']:.0%} on average",
         "camera": f"{notes['fov_degrees']} degrees diagonal, {notes['fov_from']}",
+        "faces read": f"in {notes['faces_read']} frames",
         "mean confidence": f"{found.frame_confidence[found.used].mean():.2f}",
     }
     gaps = ", ".join(f"{a}-{b}" if b > a else str(a) for a, b in notes["frames_without_person"])
@@ -71,7 +72,8 @@ def _rows(found: Perception, video: Mapping[str, np.ndarray]) -> list[dict[str, 
 
 def _roles(config: PerceiveConfig) -> Mapping[str, Role]:
     seen_by = networks(REQUIRED)
-    return {"body": packaged_body(), "pose": seen_by, "mask": seen_by}
+    learned = {"corrector": packaged("corrector.safetensors"), "face map": packaged("face.safetensors")}
+    return {"body": packaged_body(), "pose": seen_by, "mask": seen_by, "head": ours("body's head region"), **learned}
 
 
-PERCEIVE = Stage("perceive", 2, PerceiveConfig, ("ingest",), run_perceive, _roles)
+PERCEIVE = Stage("perceive", 3, PerceiveConfig, ("ingest",), run_perceive, _roles)

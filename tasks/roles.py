@@ -37,6 +37,13 @@ def _licensed_body(versions: tuple[tuple[Path, int], ...]) -> Role:
     return Role(f"{versions[0][0].stem} (your file)", "its makers' terms, which you agreed to", digest)
 
 
+@cache
+def packaged(asset: str) -> Role:
+    """Weights of our own that ship with the package; the card beside them says how they were made."""
+    content = resources.files("ahoy_core.assets").joinpath(asset).read_bytes()
+    return Role(asset, "Apache-2.0", hashlib.sha256(content).hexdigest())
+
+
 def networks(names: Iterable[str]) -> Role:
     """Networks of the model manifest, together filling one role."""
     models = [model for model in list_models() if model.name in set(names)]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
@@ -80,7 +80,7 @@ def fit_body(
         raise ValueError("expected at least one frame with landmarks, got none")
     if masks is not None and len(masks) != len(seen.points):
         raise ValueError(f"expected one mask for each of {len(seen.points)} frames, got {len(masks)}")
-    seen = replace(seen, **{k: getattr(seen, k).double() for k in ("points", "weights", "world", "times", "K")})
+    seen = _doubled(seen)
     betas = body.default_betas.double()
     prior = build_prior(body, betas)
     reduced = reduce_body(body, prior.free, betas)
@@ -104,10 +104,16 @@ def fit_body(
     goal = objective
     for i in range(rounds):
         assert masks is not None
-        edges = find_edges(reduced, make_skin(body, reduced), state, masks, seen.weights, seen.K)
+        edges = find_edges(reduced, make_skin(body, reduced), state, masks, seen.visible, seen.K)
         goal = replace(objective, outline=edges)
         state = stage(state, 1 + len(SCALES) + i, SCALES[-1], goal)
     return _finish(goal, reduced, state, body)
+
+
+def _doubled(seen: Observations) -> Observations:
+    """The same in float64, but for the shot numbers."""
+    values = {f.name: getattr(seen, f.name) for f in fields(seen) if f.name != "shot"}
+    return replace(seen, **{name: value.double() for name, value in values.items() if value is not None})
 
 
 def _start(objective: Objective, reduced: ReducedBody) -> State:
@@ -175,7 +181,7 @@ def _finish(objective: Objective, reduced: ReducedBody, state: State, body: Body
         transl=state.transl(reduced).to(body.default_betas),
         betas=state.betas.to(body.default_betas),
         landmarks=landmarks,
-        landmark_confidence=seen.weights * torch.exp(-((error / AGREEMENT) ** 2)),
-        image_error=float((seen.weights * error).sum() / seen.weights.sum().clamp_min(1e-6)),
+        landmark_confidence=seen.visible * torch.exp(-((error / AGREEMENT) ** 2)),
+        image_error=float((seen.visible * error).sum() / seen.visible.sum().clamp_min(1e-6)),
         costs={name: round(cost / len(landmarks), 4) for name, cost in final.items()},
     )

@@ -9,10 +9,11 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from ahoy_core.perceive.corrector import MIRROR as MIRROR_BODY
 from ahoy_core.perceive.crop import Roi, paste, roi_from_points, sample
-from ahoy_core.perceive.detection import detect
 from ahoy_core.perceive.networks import LANDMARKER_SIZE, N_LANDMARKS, Networks, RawLandmarks, sigmoid
-from ahoy_core.perceive.tracking import Track, choose, link
+from ahoy_core.perceive.people import find_people
+from ahoy_core.perceive.tracking import Track, belongs_to_another, choose
 
 Progress = Callable[[int, int, str], None]
 
@@ -22,12 +23,8 @@ HIPS, CIRCLE = 33, 34  # raw landmarks that steer the next frame's crop
 HEATMAP_WINDOW = 3  # cells to each side that refine a landmark
 MIN_HEAT = 0.5  # below it the heatmap says nothing
 PASSES = 4
-# BlazePose's 33 landmarks with left and right exchanged.
-MIRROR = np.array(
-    [0, 4, 5, 6, 1, 2, 3, 8, 7, 10, 9]
-    + [i + (1 if i % 2 else -1) for i in range(11, N_LANDMARKS)]
-    + list(range(N_LANDMARKS, 39))
-)
+# The network's 39 raw landmarks with left and right exchanged.
+MIRROR = np.array([*MIRROR_BODY, *range(N_LANDMARKS, 39)])
 
 
 @dataclass(frozen=True)
@@ -63,7 +60,7 @@ class LandmarkTrack:
 
 
 @dataclass(frozen=True)
-class _Reading:
+class Reading:
     """The network's answer for one crop, in the image: points [39,3], world [39,3], visibility [39], mask, score."""
 
     points: NDArray[np.float64]
@@ -74,6 +71,7 @@ class _Reading:
     roi: Roi
 
     def next_roi(self) -> Roi:
+        """The crop for the next frame, as the network steers it."""
         return roi_from_points(self.points[HIPS, :2], self.points[CIRCLE, :2])
 
 
@@ -92,7 +90,7 @@ def run_landmarks(
         networks: the loaded networks.
         frames: [T,H,W,3] sRGB.
         shot: [T] shot number of each frame; one shot unless given.
-        subject: number of the person, 0 the most prominent; None: the most prominent of each shot.
+        subject: number of the person, 0 or None the most prominent.
         passes: 1 forward; 2 also mirrored; 3 forward, mirrored and backward in time; 4 also backward mirrored. Their
             mean is returned.
         progress: called with steps done and in total.
@@ -113,15 +111,12 @@ def run_landmarks(
         if progress:
             progress(done, total, note)
 
-    detections = []
-    for frame in frames:
-        detections.append(detect(networks, frame))
-        tick("finding people")
-    tracks = link(detections, cuts)
+    tracks = find_people(networks, frames, cuts, tick)
     track = choose(tracks, cuts, subject)
-    runs = [_follow(networks, frames, cuts, track, range(len(frames)), passes >= 2, tick)]
+    runs = [_follow(networks, frames, cuts, track, tracks, range(len(frames)), passes >= 2, tick)]
     if backward:
-        runs.append(_follow(networks, frames, cuts, track, range(len(frames) - 1, -1, -1), passes == 4, tick))
+        order = range(len(frames) - 1, -1, -1)
+        runs.append(_follow(networks, frames, cuts, track, tracks, order, passes == 4, tick))
     return _collect([_average([run[t] for run in runs]) for t in range(len(frames))], len(tracks))
 
 
@@ -130,13 +125,14 @@ def _follow(
     frames: NDArray[np.uint8],
     shot: NDArray[np.integer],
     track: Track,
+    tracks: list[Track],
     order: range,
     mirrored: bool,
     tick: Callable[[str], None],
-) -> dict[int, list[_Reading]]:
+) -> dict[int, list[Reading]]:
     """Read every frame in the given order, each crop placed by the frame before it or by the detector."""
     shots_with_subject = {int(shot[t]) for t in track.rois}
-    readings: dict[int, list[_Reading]] = {}
+    readings: dict[int, list[Reading]] = {}
     roi: Roi | None = None
     previous = order[0]
     for t in order:
@@ -147,11 +143,13 @@ def _follow(
         if int(shot[t]) not in shots_with_subject:
             continue
         reading = _read_first(networks, frames[t], _candidates(roi, track, t))
+        if reading and belongs_to_another(reading.next_roi(), track, tracks, t):
+            reading = None
         roi = reading.next_roi() if reading else None
         if reading:
             readings[t].append(reading)
             if mirrored:
-                readings[t].append(_read(networks, frames[t], reading.roi, mirrored=True))
+                readings[t].append(read_crop(networks, frames[t], reading.roi, mirrored=True))
     return readings
 
 
@@ -166,15 +164,15 @@ def _candidates(followed: Roi | None, track: Track, t: int) -> list[Roi]:
     return [followed, detected] if drift < MAX_DRIFT else [detected, followed]
 
 
-def _read_first(networks: Networks, frame: NDArray[np.uint8], rois: list[Roi]) -> _Reading | None:
+def _read_first(networks: Networks, frame: NDArray[np.uint8], rois: list[Roi]) -> Reading | None:
     for roi in rois:
-        reading = _read(networks, frame, roi)
+        reading = read_crop(networks, frame, roi)
         if reading.score >= MIN_SCORE:
             return reading
     return None
 
 
-def _read(networks: Networks, frame: NDArray[np.uint8], roi: Roi, mirrored: bool = False) -> _Reading:
+def read_crop(networks: Networks, frame: NDArray[np.uint8], roi: Roi, mirrored: bool = False) -> Reading:
     """Run the network on one crop (seen in a mirror if asked) and return its answer in image coordinates."""
     crop = sample(frame, roi, LANDMARKER_SIZE)
     raw = networks.landmarks(crop[:, ::-1] if mirrored else crop)
@@ -185,7 +183,7 @@ def _read(networks: Networks, frame: NDArray[np.uint8], roi: Roi, mirrored: bool
         points[:, 0] = 1.0 - points[:, 0]
         world[:, 0] = -world[:, 0]
     rotation = roi.matrix()[:, :2] / roi.size
-    return _Reading(
+    return Reading(
         points=np.concatenate([roi.to_image(points[:, :2]), points[:, 2:] * roi.size], axis=1),
         world=np.concatenate([world[:, :2] @ rotation.T, world[:, 2:]], axis=1),
         visibility=visibility.astype(np.float64),
@@ -215,7 +213,7 @@ def _refine(raw: RawLandmarks) -> NDArray[np.float64]:
     return points
 
 
-def _average(groups: list[list[_Reading]]) -> _Reading | None:
+def _average(groups: list[list[Reading]]) -> Reading | None:
     """Average readings of one frame: landmarks by visibility, masks in the first one's crop."""
     readings = [reading for group in groups for reading in group if reading.score >= MIN_SCORE]
     if not readings:
@@ -234,7 +232,7 @@ def _average(groups: list[list[_Reading]]) -> _Reading | None:
     )
 
 
-def _recrop(reading: _Reading, roi: Roi) -> NDArray[np.float32]:
+def _recrop(reading: Reading, roi: Roi) -> NDArray[np.float32]:
     """Resample a mask from its own crop into another one."""
     corners = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
     a, b, c = reading.roi.to_crop(roi.to_image(corners)) * LANDMARKER_SIZE
@@ -245,7 +243,7 @@ def _recrop(reading: _Reading, roi: Roi) -> NDArray[np.float32]:
     return sample(mask, Roi(float(centre[0]), float(centre[1]), size, angle), LANDMARKER_SIZE)[..., 0]
 
 
-def _collect(readings: list[_Reading | None], people: int) -> LandmarkTrack:
+def _collect(readings: list[Reading | None], people: int) -> LandmarkTrack:
     """Stack the readings of all frames."""
     n = len(readings)
     landmarks = np.zeros((n, N_LANDMARKS, 3), np.float32)

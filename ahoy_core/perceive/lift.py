@@ -26,7 +26,7 @@ def root_rotations(rest_landmarks: Tensor, seen: Observations) -> Tensor:
         [N,3,3] root rotations in the world.
     """
     torso = list(TORSO)
-    weights = seen.weights[:, torso, None]
+    weights = seen.world_weights[:, torso, None]
     weights = torch.where(weights.sum(1, keepdim=True) < ENOUGH_WEIGHT, torch.ones_like(weights), weights)
     weights = weights / weights.sum(1, keepdim=True)
     theirs = seen.world[:, torso]

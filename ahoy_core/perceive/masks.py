@@ -28,7 +28,7 @@ class FrameMasks:
 
     Attributes:
         visible: [H,W] uint8 alpha of the visible part.
-        amodal: [H,W] uint8 silhouette of the body, hidden parts included.
+        amodal: [H,W] uint8 the whole person, hidden parts included: the body, and what is visible.
         box: [4] float32, x0, y0, x1, y1 of the visible part in pixels; zeros where nothing is visible.
         occluded: share in [0,1] of the silhouette inside the picture that is not visible.
     """
@@ -39,19 +39,19 @@ class FrameMasks:
     occluded: float
 
 
-def frame_masks(soft: NDArray[np.uint8], amodal: NDArray[np.uint8]) -> FrameMasks:
-    """Turn a refined mask into the visible person's alpha.
+def frame_masks(soft: NDArray[np.uint8], silhouette: NDArray[np.uint8]) -> FrameMasks:
+    """Turn a refined mask into the visible person's alpha, and a naked silhouette into the whole person's.
 
     Args:
         soft: [H,W], 0 to 255.
-        amodal: [H,W] silhouette of the fitted body.
+        silhouette: [H,W] of the fitted body.
     """
     part = np.clip((soft.astype(np.float32) / 255.0 - SOFT_LOW) / (SOFT_HIGH - SOFT_LOW), 0.0, 1.0)
-    alpha = part * part * (3.0 - 2.0 * part) * near_body(amodal)
+    alpha = part * part * (3.0 - 2.0 * part) * near_body(silhouette)
     visible = np.round(alpha * 255).astype(np.uint8)
-    body, seen = amodal > VISIBLE, visible > VISIBLE
+    body, seen = silhouette > VISIBLE, visible > VISIBLE
     occluded = 1.0 - float((body & seen).sum()) / max(int(body.sum()), 1) if body.any() else 0.0
-    return FrameMasks(visible, amodal, mask_box(visible), occluded)
+    return FrameMasks(visible, np.maximum(silhouette, visible), mask_box(visible), occluded)
 
 
 def refine(frame: NDArray[np.uint8], soft: NDArray[np.float32], crop_size: float) -> NDArray[np.uint8]:

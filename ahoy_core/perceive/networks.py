@@ -21,12 +21,14 @@ from numpy.typing import NDArray
 
 DETECTOR_SIZE = 224
 LANDMARKER_SIZE = 256
+FACE_SIZE = 192
+N_FACE = 468
 N_LANDMARKS = 33
 N_RAW = 39  # 33 landmarks of the body and six that only steer the crop of the next frame
 STDERR = 2  # the descriptor
 _STDERR = threading.Lock()
 BANNER = b"INFO: Created TensorFlow Lite XNNPACK delegate for CPU."
-REQUIRED = ("pose_detection", "pose_landmark_full")
+REQUIRED = ("pose_detection", "pose_landmark_full", "face_landmark")
 
 
 @dataclass(frozen=True)
@@ -117,6 +119,7 @@ class Networks:
             raise ValueError(f"expected num_threads of at least 1, got {num_threads}")
         self._detector: Any = _Network(paths["pose_detection"], num_threads)
         self._landmarker: Any = _Network(paths["pose_landmark_full"], num_threads)
+        self._face: Any = _Network(paths["face_landmark"], num_threads)
 
     def detect(self, image: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Run the detector.
@@ -143,6 +146,15 @@ class Networks:
             mask=sigmoid(out["Identity_2"][..., 0]),
             heatmap=out["Identity_3"],
         )
+
+    def face(self, image: NDArray[np.float32]) -> tuple[NDArray[np.float32], float]:
+        """Run the face network on one upright crop, [192,192,3] sRGB in [0,1].
+
+        Returns:
+            Landmarks [468,3] in crop pixels (z negative towards the camera), and a score in [0,1]: a face is there.
+        """
+        points, score = sorted(self._face(image).values(), key=lambda values: -values.size)
+        return points.reshape(N_FACE, 3), float(sigmoid(score.reshape(-1))[0])
 
 
 def sigmoid(x: NDArray[np.float32]) -> NDArray[np.float32]:

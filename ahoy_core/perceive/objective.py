@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from ahoy_core.perceive.ground import GROUND_SCALE, GROUND_SPREAD, SOLES, lowest_sole
 from ahoy_core.perceive.normal import Normal, add_rows, empty_normal
 from ahoy_core.perceive.outline import (
     OUTLINE_SCALE,
@@ -96,7 +97,7 @@ def pose_weights(reduced: ReducedBody, seen: Observations, config: FitConfig) ->
     One weight for all either leaves hidden limbs to the network's guesses or keeps visible ones from bending.
     """
     moves = reduced.moments[..., 3] @ below(reduced.parents).to(reduced.moments).T > 0.5
-    known = torch.where(moves[None], seen.weights[..., None], 0.0).amax(1)[:, 1:]
+    known = torch.where(moves[None], seen.visible[..., None], 0.0).amax(1)[:, 1:]
     return config.pose_prior * (SEEN_SHARE + (1 - SEEN_SHARE) * (1 - known))
 
 
@@ -126,11 +127,14 @@ def _seen_terms(
 ) -> dict[str, Tensor]:
     seen, config = objective.seen, objective.config
     squared = world_offsets(landmarks, seen, state.log_scale).square().sum(-1)
-    world = (seen.weights * geman_mcclure(squared, WORLD_SCALE)).sum() / WORLD_SPREAD**2
+    world = (seen.world_weights * geman_mcclure(squared, WORLD_SCALE)).sum() / WORLD_SPREAD**2
     terms = {"world": config.world_weight * world}
     if scale is not None:
         squared = image_offsets(landmarks, seen, person).square().sum(-1)
         terms["image"] = (seen.weights * geman_mcclure(squared, scale)).sum() / LANDMARK_SPREAD**2
+    if seen.ground is not None:
+        height, _ = lowest_sole(landmarks, seen.ground)
+        terms["ground"] = geman_mcclure(height.square(), GROUND_SCALE).sum() / GROUND_SPREAD**2
     return terms
 
 
@@ -202,11 +206,12 @@ def _add_seen(
     seen, config = objective.seen, objective.config
     per_frame = normal.gradient.shape[1]
     offsets = world_offsets(linear.landmarks, seen, state.log_scale)
-    rows = centred(linear.d_landmarks, seen.weights)
-    rows[..., -1] = -state.log_scale.exp() * centred(seen.world, seen.weights)
-    weights = seen.weights * geman_mcclure_weight(offsets.square().sum(-1), WORLD_SCALE)
+    rows = centred(linear.d_landmarks, seen.world_weights)
+    rows[..., -1] = -state.log_scale.exp() * centred(seen.world, seen.world_weights)
+    weights = seen.world_weights * geman_mcclure_weight(offsets.square().sum(-1), WORLD_SCALE)
     root = (config.world_weight * weights).sqrt()[..., None] / WORLD_SPREAD
     _add_rows(normal, root * offsets, root[..., None] * rows, per_frame)
+    _add_ground(normal, objective, linear)
     if scale is None:
         return
     offsets = image_offsets(linear.landmarks, seen, person)
@@ -214,6 +219,17 @@ def _add_seen(
     weights = seen.weights * geman_mcclure_weight(offsets.square().sum(-1), scale)
     root = weights.sqrt()[..., None] / LANDMARK_SPREAD
     _add_rows(normal, root * offsets, root[..., None] * rows, per_frame)
+
+
+def _add_ground(normal: Normal, objective: Objective, linear: Linearised) -> None:
+    ground = objective.seen.ground
+    if ground is None:
+        return
+    height, slopes = lowest_sole(linear.landmarks, ground)
+    rows = torch.einsum("nkip,nki->np", linear.d_landmarks[:, list(SOLES)], slopes)
+    root = geman_mcclure_weight(height.square(), GROUND_SCALE).sqrt() / GROUND_SPREAD
+    per_frame = normal.gradient.shape[1]
+    _add_rows(normal, (root * height)[:, None, None], (root[:, None] * rows)[:, None, None], per_frame)
 
 
 def _add_outline(normal: Normal, objective: Objective, reduced: ReducedBody, state: State, person: Tensor) -> None:

@@ -22,19 +22,26 @@ class Observations:
 
     Attributes:
         points: [N,33,2] pixels.
-        weights: [N,33] in [0,1]; what weighs 0 has no influence at all.
+        weights: [N,33] in [0,1] of the points; what weighs 0 has no influence at all.
         world: [N,33,3] metres in world axes (z up), hips at the origin.
+        world_weights: [N,33] in [0,1] of `world`.
+        visible: [N,33] in [0,1]: how sure it is that the landmark is seen, not guessed.
         times: [N] seconds.
         shot: [N] shot numbers.
         K: [3,3] pixels.
+        ground: [4] the floor's upward unit normal in world axes, and metres that the world's origin (the camera) is
+            above the floor; None where unknown.
     """
 
     points: Tensor
     weights: Tensor
     world: Tensor
+    world_weights: Tensor
+    visible: Tensor
     times: Tensor
     shot: Tensor
     K: Tensor
+    ground: Tensor | None = None
 
 
 def geman_mcclure(squared: Tensor, scale: float) -> Tensor:
@@ -91,7 +98,7 @@ def centred(points: Tensor, weights: Tensor) -> Tensor:
 
 def world_offsets(landmarks: Tensor, seen: Observations, log_scale: Tensor) -> Tensor:
     """Offsets [N,33,3] in metres between the body's 3D and the network's, scaled, each about its mean."""
-    return centred(landmarks, seen.weights) - log_scale.exp() * centred(seen.world, seen.weights)
+    return centred(landmarks, seen.world_weights) - log_scale.exp() * centred(seen.world, seen.world_weights)
 
 
 @dataclass(frozen=True)

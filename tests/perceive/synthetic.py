@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -18,6 +18,7 @@ from ahoy_core.perceive.objective import STATURE
 from ahoy_core.perceive.reduced import reduce_body
 from ahoy_core.perceive.residuals import Observations
 
+PER_FRAME = ("points", "weights", "world", "world_weights", "visible")  # of the observations
 HEIGHT, WIDTH, FOCAL = 480, 640, 700.0
 STATURE_BETA = BETA_NAMES.index("height")
 
@@ -78,11 +79,18 @@ def make_scene(
         points=project(points, OBSERVED_VIEWMAT, camera()).pixels,
         weights=torch.ones(frames, 33),
         world=points - hips,
+        world_weights=torch.ones(frames, 33),
+        visible=torch.ones(frames, 33),
         times=torch.arange(frames) / fps,
         shot=torch.zeros(frames, dtype=torch.int64),
         K=camera(),
     )
     return Scene(pose, transl, betas, output.joints, seen)
+
+
+def weighted(seen: Observations, weights: Tensor) -> Observations:
+    """The same observations, trusted by weights [N,33] in the picture, in space and as seen."""
+    return replace(seen, weights=weights, world_weights=weights, visible=weights)
 
 
 def draw_masks(body: BodyModel, scene: Scene) -> NDArray[np.uint8]:

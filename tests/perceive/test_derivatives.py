@@ -26,20 +26,23 @@ from ahoy_core.perceive.residuals import (
     world_offsets,
 )
 from ahoy_core.perceive.state import State, linearise, right_jacobian
-from tests.perceive.synthetic import make_scene
+from tests.perceive.synthetic import make_scene, weighted
 
 FRAMES = 4
 
 
 def double(seen: Observations) -> Observations:
-    return replace(seen, **{k: getattr(seen, k).double() for k in ("points", "weights", "world", "times", "K")})
+    names = ("points", "weights", "world", "world_weights", "visible", "times", "K")
+    return replace(seen, **{k: getattr(seen, k).double() for k in names})
 
 
 def setting(body: PackagedBody, seed: int = 0) -> tuple[Objective, ReducedBody, State]:
     """A state in general position: limits exceeded here and there, landmarks of all weights."""
     draw = torch.Generator().manual_seed(seed)
     seen = double(make_scene(body, FRAMES).seen)
-    seen = replace(seen, weights=torch.rand(FRAMES, 33, generator=draw).double())
+    seen = weighted(seen, torch.rand(FRAMES, 33, generator=draw).double())
+    # A floor near the soles, and tilted, so that it bears on every number.
+    seen = replace(seen, ground=torch.tensor([0.1, -0.17, 0.98, 1.2]).double())
     betas = body.default_betas.double()
     prior = build_prior(body, betas)
     reduced = reduce_body(body, prior.free, betas)

@@ -12,7 +12,7 @@ from ahoy_core.body.packaged import PackagedBody
 from ahoy_core.perceive.fit import Fit, fit_body
 from ahoy_core.perceive.objective import FitConfig
 from ahoy_core.perceive.priors import RULES, build_prior
-from tests.perceive.synthetic import Scene, make_scene, similarity_error
+from tests.perceive.synthetic import PER_FRAME, Scene, make_scene, similarity_error, weighted
 
 # Perfect landmarks; what is left is the pull of the priors. Twice what was measured.
 BOUND_M = 0.012
@@ -38,10 +38,10 @@ def test_a_landmark_of_weight_zero_has_no_influence(body: PackagedBody) -> None:
     scene = make_scene(body, frames=3)
     weights = scene.seen.weights.clone()
     weights[:, 15] = 0
-    plain = fit_body(body, replace(scene.seen, weights=weights), FitConfig())
+    plain = fit_body(body, weighted(scene.seen, weights), FitConfig())
     points, world = scene.seen.points.clone(), scene.seen.world.clone()
     points[:, 15], world[:, 15] = 1e4, 50.0
-    wild = fit_body(body, replace(scene.seen, weights=weights, points=points, world=world), FitConfig())
+    wild = fit_body(body, replace(weighted(scene.seen, weights), points=points, world=world), FitConfig())
     assert torch.equal(plain.pose, wild.pose)
 
 
@@ -62,7 +62,7 @@ def test_one_frame_is_enough(body: PackagedBody) -> None:
 
 def test_nothing_seen_at_all_stays_finite_and_near_standing(body: PackagedBody) -> None:
     scene = make_scene(body, frames=3)
-    fit = fit_body(body, replace(scene.seen, weights=torch.zeros(3, 33)), FitConfig())
+    fit = fit_body(body, weighted(scene.seen, torch.zeros(3, 33)), FitConfig())
     assert all(bool(torch.isfinite(t).all()) for t in (fit.pose, fit.transl, fit.betas))
     assert float(fit.pose[:, 1:].norm(dim=-1).max()) < 1.2
     assert float(fit.landmark_confidence.max()) == 0
@@ -70,7 +70,7 @@ def test_nothing_seen_at_all_stays_finite_and_near_standing(body: PackagedBody) 
 
 def test_a_cut_does_not_drag_one_shots_pose_into_the_other(body: PackagedBody) -> None:
     first, second = make_scene(body, 3, facing=0.3, fps=4), make_scene(body, 3, facing=2.5, fps=4)
-    both = {k: torch.cat([getattr(first.seen, k), getattr(second.seen, k)]) for k in ("points", "weights", "world")}
+    both = {k: torch.cat([getattr(first.seen, k), getattr(second.seen, k)]) for k in PER_FRAME}
     times = torch.tensor([0.0, 0.25, 0.5, 0.53, 0.78, 1.03])
     seen = replace(first.seen, **both, times=times, shot=torch.tensor([0, 0, 0, 1, 1, 1]))
     fit = fit_body(body, seen, FitConfig())
@@ -82,14 +82,14 @@ def test_hidden_legs_stand(body: PackagedBody) -> None:
     scene = make_scene(body, frames=4)
     weights = scene.seen.weights.clone()
     weights[:, 25:] = 0
-    fit = fit_body(body, replace(scene.seen, weights=weights), FitConfig())
+    fit = fit_body(body, weighted(scene.seen, weights), FitConfig())
     knees = [body.joint_names.index(f"lowerleg01.{side}") for side in "LR"]
     assert float((fit.pose[:, knees].norm(dim=-1) - RULES["knee"].bent).abs().max()) < 0.05
 
 
 def test_no_frames_is_an_error_that_says_so(body: PackagedBody) -> None:
     seen = make_scene(body, 2).seen
-    none = {k: getattr(seen, k)[:0] for k in ("points", "weights", "world", "times", "shot")}
+    none = {k: getattr(seen, k)[:0] for k in (*PER_FRAME, "times", "shot")}
     with pytest.raises(ValueError, match="at least one frame"):
         fit_body(body, replace(seen, **none), FitConfig())
 

@@ -1,0 +1,38 @@
+"""Knobs of the stage perceive."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class PerceiveConfig(BaseModel):
+    """Knobs of the stage.
+
+    Attributes:
+        model: the landmark network that fills the roles pose and mask.
+        passes: readings averaged per frame: 1 forward, 2 also mirrored, 3 also backward in time, 4 backward mirrored
+            too.
+        stride: look at every stride-th frame; the others get poses in between and count as unused.
+        subject: number of the person, 0 or None the most prominent.
+        iterations: most steps in each of the fit's stages; it stops earlier when nothing is gained.
+        smoothing: weight of accelerations in the fit.
+        fov_degrees: diagonal field of view assumed where no camera is given.
+        outline: weight of the masks' outlines in the fit; 0: landmarks alone.
+        mask_refinement: move the mask's edges to the picture's, and hold it down where a still camera shows no change.
+        corrector: let the packaged network correct the landmarks and say how far each can be trusted.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    model: Literal["pose_landmark_full"] = "pose_landmark_full"
+    passes: Literal[1, 2, 3, 4] = 2
+    stride: int = Field(default=1, ge=1, le=100)
+    subject: int | None = Field(default=None, ge=0)
+    iterations: int = Field(default=10, ge=1, le=1000)
+    smoothing: float = Field(default=1.0, ge=0.0, le=1000.0)
+    fov_degrees: float = Field(default=50.0, gt=5.0, lt=150.0)
+    outline: float = Field(default=1.0, ge=0.0, le=1000.0)
+    corrector: bool = True
+    mask_refinement: bool = True

@@ -1,0 +1,57 @@
+"""Somebody stands on a known floor."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from ahoy_core.body.packaged import PackagedBody
+from ahoy_core.conventions import look_at
+from ahoy_core.perceive.fit import fit_body
+from ahoy_core.perceive.ground import CLEARANCE, ground_from_camera, lowest_sole
+from ahoy_core.perceive.objective import FitConfig
+from tests.perceive.synthetic import average_betas, make_scene
+
+
+def test_the_floor_is_found_from_where_the_camera_stands() -> None:
+    view = look_at(torch.tensor([1.0, -3.0, 1.5]), torch.tensor([0.0, 0.0, 0.5])).double().numpy()
+    ground = ground_from_camera(view).numpy()
+    assert np.linalg.norm(ground[:3]) == pytest.approx(1.0) and ground[3] == pytest.approx(1.5)
+    # A point of the floor, in the camera's axes and then in those of the observed world, is at height 0.
+    camera = view[:3, :3] @ np.array([0.3, 0.4, 0.0]) + view[:3, 3]
+    observed = np.array([camera[0], camera[2], -camera[1]])
+    assert ground[:3] @ observed + ground[3] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_the_lowest_sole_is_level_when_standing_and_smooth_when_weight_shifts() -> None:
+    landmarks = torch.zeros(2, 33, 3, dtype=torch.float64)
+    landmarks[:, 29:33, 2] = torch.tensor(CLEARANCE).double()
+    landmarks[1, [30, 32], 2] += 0.3
+    ground = torch.tensor([0.0, 0.0, 1.0, 0.0]).double()
+    heights, _ = lowest_sole(landmarks, ground)
+    # Both feet or one: within what four soles instead of two make, 0.02 m log 2.
+    assert float(heights.abs().max()) < 0.015
+    points = (
+        landmarks + 0.02 * torch.randn(2, 33, 3, generator=torch.Generator().manual_seed(0)).double()
+    ).requires_grad_()
+    (slope,) = torch.autograd.grad(lowest_sole(points, ground)[0].sum(), points)
+    torch.testing.assert_close(slope[:, [29, 30, 31, 32]], lowest_sole(points, ground)[1].detach())
+
+
+def test_a_known_floor_tells_a_small_person_from_a_far_one(body: PackagedBody) -> None:
+    betas = average_betas(body)
+    betas[body.beta_names.index("height")] -= 0.25
+    scene = make_scene(body, frames=4, betas=betas, rise=0.0)
+    floor = float(body(scene.pose, betas[None], scene.transl).vertices[..., 2].min()) - 0.012
+    # The knees bend while the root stays, so the soles leave the floor: only the first frame stands.
+    still = replace(scene.seen, **{k: getattr(scene.seen, k)[:1].repeat(3, *[1] * (getattr(scene.seen, k).ndim - 1))
+                                   for k in ("points", "weights", "world", "world_weights", "visible")},
+                    times=scene.seen.times[:3], shot=scene.seen.shot[:3])  # fmt: skip
+    with_floor = replace(still, ground=torch.tensor([0.0, 0.0, 1.0, -floor]))
+    depth = float(scene.transl[0, 1])
+    blind, told = (float(fit_body(body, seen, FitConfig()).transl[:, 1].mean()) - depth for seen in (still, with_floor))
+    # 0.135 m was measured: the stature's prior still pulls.
+    assert abs(told) < min(0.16, abs(blind))
