@@ -18,8 +18,6 @@ from storage_schema.secrets import RedactSecrets
 
 if TYPE_CHECKING:
     from flows.request import VideoRequest
-    from tasks.settings import Settings
-    from tasks.stage import Run, Source
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 app.add_typer(models_cli.app, name="models")
