@@ -13,6 +13,8 @@ from torch import Tensor
 
 from ahoy_core.body.packaged import load_packaged_body
 from ahoy_core.body.smpl_load import load_smpl
+from ahoy_core.metrics.perceptual import Perceptual
+from ahoy_core.metrics.stlpips import load_stlpips
 from ahoy_core.texture.fill import fill_atlas
 from ahoy_core.texture.fillings import TexturedBody
 from ahoy_core.texture.selfcheck import Completion
@@ -34,6 +36,8 @@ class Views(Protocol):
         ...
 
 
+__all__ = ["COMPLETIONS", "FILLINGS", "Inpaint", "Perceptual", "Views"]
+
 COMPLETIONS: Final[Mapping[str, Completion]] = {
     "symmetry + harmonic": partial(fill_atlas, fill="both"),
     "harmonic": partial(fill_atlas, fill="harmonic"),
@@ -45,5 +49,6 @@ FILLINGS: Final[Mapping[str, Mapping[str, Callable[..., Any]]]] = {
     "body": {"packaged": load_packaged_body, "smpl": load_smpl},
     "inpaint": {"textured body": TexturedBody.inpaint},
     "views": {"textured body": TexturedBody.views},
+    "perceptual": {"ST-LPIPS": load_stlpips},
 }
 """Role -> name -> what fills it: loaders of bodies, methods of a person's `TexturedBody`."""

@@ -1,11 +1,18 @@
-"""The coarse avatar of captures whose truth is known: `python -m benchmarks.avatar CAPTURES_DIR --json OUT`.
+"""The avatars of captures whose truth is known: `python -m benchmarks.avatar CAPTURES_DIR --json OUT`.
 
-Pose, camera and visible mask are the true ones, so what is measured is texture and training, not perception. One JSON
-line per capture, after one that names the machine. `psnr_novel_view` and `iou` are means over the four true cameras and
-all their frames: the whole clothed person, hidden parts too, in the box of the true alpha, over grey 0.5.
-`psnr_held_out` is that of the frame that training never saw, under the protocol `input-view`; `..._template` is the
-textured body before training. `seconds`, `cpu_seconds` and `peak_mb` are those of the training
-(the peak of the whole process).
+Pose, camera and visible mask are the true ones, so what is measured is training, not perception. One JSON line per
+capture and configuration, after one that names the machine:
+
+- `upper`: the full avatar on the true pictures of all cameras at frames 0, 12, 24, 36 (what it can hold at all);
+- `upper-CAMERA`: the same without that camera, which alone is scored as the novel view;
+- `full`, `C1`, `C2`, `C`, `C3`, `D`: observed video, and those pictures made inconsistent as a generator's
+  (benchmarks/avatar_supervision.py states the amounts), under the switches of the ablation;
+- `coarse` (= `A`): the coarse avatar from the video alone.
+
+`psnr_novel_view` is over frames 6, 18, 30, 42 of all cameras, `psnr_novel_pose` over the unseen motion, `psnr_head`
+over the head's box of the former; all in the box of the true alpha over grey 0.5 at the capture's size, mean of
+pictures. `seconds`, `cpu_seconds` and `peak_mb` (of the process) are those of the training; `fps` is posing and
+rendering one frame of the unseen motion at that size, every pose new. `held_out` is the score under `input-view`.
 """
 
 from __future__ import annotations
@@ -13,6 +20,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,51 +29,128 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ahoy_core.avatar.avatar import Avatar, AvatarInfo
-from ahoy_core.avatar.coarse import train_coarse
+from ahoy_core.avatar import AvatarInfo, train_coarse, train_full
+from ahoy_core.avatar.avatar import Avatar
+from ahoy_core.avatar.coarse import textured_template
+from ahoy_core.avatar.full_config import ABLATIONS, FullConfig
+from ahoy_core.avatar.full_inputs import FullInputs
+from ahoy_core.avatar.kinematics import Kinematics
 from ahoy_core.avatar.render import render
 from ahoy_core.avatar.supervision import CoarseInputs
 from ahoy_core.body.packaged import PackagedBody, load_packaged_body
-from ahoy_core.conventions import GREY, OBSERVED_VIEWMAT, Cameras
+from ahoy_core.conventions import OBSERVED_VIEWMAT, Cameras
 from ahoy_core.cost import Meter, machine
 from ahoy_core.formats.images import to_float
-from ahoy_core.metrics import iou, psnr
-from ahoy_core.metrics.regions import mask_box
+from ahoy_core.maps.template import Template
 from ahoy_core.perceive.masks import silhouette
 from ahoy_core.texture.texture import Texture, build_texture
+from benchmarks.avatar_scores import scores
+from benchmarks.avatar_supervision import TESTED, inconsistent, true_faces, true_sequences
 from benchmarks.captures import Capture, capture_folders, posed_vertices, read_capture, true_fit
 from tasks.presets import PRESETS
+from tasks.roles import perceptual_network
 from tasks.settings import Settings
 
 Fit = Mapping[str, NDArray[np.generic]]
+CAMERAS = ("front", "left", "back", "right")
+CONFIGS = ("upper", *(f"upper-{name}" for name in CAMERAS), "coarse", "full", "C1", "C2", "C", "C3", "D")
 
 
-def measure(capture: Capture, body: PackagedBody, settings: Settings, config: str) -> dict[str, Any]:
-    """Train on one capture and score the result."""
-    fit = true_fit(capture, body)
-    texture = build_texture(capture.frames, capture.visible, fit, body, settings.texture)
-    inputs = coarse_inputs(capture, body, fit, texture)
+class Subject:
+    """One capture with what every configuration starts from."""
+
+    def __init__(self, folder: Path, body: PackagedBody, settings: Settings) -> None:
+        self.capture, self.body, self.settings = read_capture(folder), body, settings
+        self.fit = true_fit(self.capture, body)
+        texture = build_texture(self.capture.frames, self.capture.visible, self.fit, body, settings.texture)
+        self.inputs = coarse_inputs(self.capture, body, self.fit, texture)
+        self.template: Template = textured_template(self.inputs, settings.coarse.map_size)
+        novel = true_fit(self.capture, body, "novel_motion.npz")
+        self.novel = torch.from_numpy(novel["pose"]), torch.from_numpy(novel["transl"])
+
+    def full_inputs(self, config: str) -> FullInputs:
+        """What the full avatar is trained on under a configuration."""
+        cameras = tuple(name for name in CAMERAS if config != f"upper-{name}")
+        sequences = true_sequences(self.capture, self.inputs.pose, self.inputs.transl, cameras)
+        kinematics = Kinematics.of(self.body, self.inputs.betas)
+        if config.startswith("upper"):
+            unseen = dict.fromkeys(("used",), torch.zeros_like(self.inputs.used))
+            observed = CoarseInputs(**{**vars(self.inputs), **unseen})
+            return FullInputs(observed, self.template, sequences=sequences)
+        faces = true_faces(sequences, self.template, kinematics, self.body.n_expressions)
+        jittered = inconsistent(sequences, self.body, self.template, self.inputs.betas, seed=0)
+        return FullInputs(self.inputs, self.template, sequences=jittered, faces=faces)
+
+
+def measure(subject: Subject, config: str, sheets: Path | None) -> dict[str, Any]:
+    """Train under one configuration and score."""
+    settings = subject.settings.avatar
+    if config in ABLATIONS:
+        settings = settings.model_copy(update={"switches": ABLATIONS[config]})
+    elif config.startswith("upper"):
+        settings = upper_bound(settings)
+    info = AvatarInfo(body=subject.body.name)
+    facts: dict[str, Any] = {}
     with Meter() as meter:
-        result = train_coarse(inputs, settings.coarse, AvatarInfo(body=body.name))
-    bill, held_out = meter.read(), result.held_out
-    scores = {name: view_scores(capture, body, fit, result.avatar, name) for name in capture.cameras}
-    mean = np.mean(list(scores.values()), axis=0)
+        if config == "coarse":
+            result = train_coarse(subject.inputs, subject.settings.coarse, info, perceptual=perceptual_network())
+        else:
+            made = train_full(subject.full_inputs(config), settings, info, perceptual=perceptual_network())
+            result = made
+            facts = {"corrections": {name: round(value, 3) for name, value in made.corrections.items()}}
+    bill = meter.read()
+    held_out = result.held_out
+    cameras = (config.removeprefix("upper-"),) if config.startswith("upper-") else CAMERAS
+    view, pose = _scored(subject, result.avatar, cameras, sheets, config)
     return {
-        "capture": capture.folder.name,
+        "capture": subject.capture.folder.name,
         "config": config,
-        "psnr_novel_view": round(float(mean[0]), 2),
-        "psnr_held_out": round(held_out.psnr_after, 2) if held_out else None,
-        "iou": round(float(mean[1]), 4),
+        "psnr_novel_view": view["psnr"],
+        "psnr_novel_pose": pose["psnr"],
+        "psnr_head": view["psnr_head"],
         "seconds": round(bill.wall_s, 1),
         "cpu_seconds": round(bill.cpu_s, 1),
+        "fps": _fps(subject, result.avatar),
         "peak_mb": bill.peak_rss_mb,
-        "psnr_held_out_template": round(held_out.psnr_before, 2) if held_out else None,
-        "ssim_held_out": round(held_out.ssim_after, 3) if held_out else None,
-        "ssim_held_out_template": round(held_out.ssim_before, 3) if held_out else None,
-        "by_camera": {name: {"psnr": round(p, 2), "iou": round(i, 4)} for name, (p, i) in scores.items()},
+        "iou_novel_view": view["iou"],
+        "iou_novel_pose": pose["iou"],
+        "psnr_head_novel_pose": pose["psnr_head"],
+        "held_out": [round(held_out.psnr_before, 2), round(held_out.psnr_after, 2)] if held_out else None,
         "gaussians": len(result.avatar),
         "steps": len(result.losses),
+        "notes": list(result.notes),
+        **facts,
     }
+
+
+def upper_bound(config: FullConfig) -> FullConfig:
+    """True supervision has nothing to correct and nothing to keep from the head."""
+    switches = config.switches.model_copy(update={"corrections": False, "head_split": False})
+    return config.model_copy(update={"switches": switches})
+
+
+def _scored(
+    subject: Subject, avatar: Avatar, cameras: Sequence[str], sheets: Path | None, config: str
+) -> tuple[dict[str, float], dict[str, float]]:
+    capture, body = subject.capture, subject.body
+    name = f"{capture.folder.name}_{config}"
+    paths = (None, None) if sheets is None else (sheets / f"{name}_view.png", sheets / f"{name}_pose.png")
+    poses, places = subject.inputs.pose, subject.inputs.transl
+    view = scores(capture, body, avatar, poses, places, TESTED, cameras, sheet=paths[0])
+    count = range(len(subject.novel[0]))
+    pose = scores(capture, body, avatar, *subject.novel, count, cameras, "novel", sheet=paths[1])
+    return view, pose
+
+
+@torch.no_grad()
+def _fps(subject: Subject, avatar: Avatar) -> float:
+    """Frames a CPU-second, posing included, every pose a new one."""
+    camera = subject.capture.cameras["front"]
+    start = time.process_time()
+    for pose, place in zip(*subject.novel, strict=True):
+        posed = avatar.pose(subject.body, pose, place)
+        render(posed.means, posed.covars, posed.opacities, posed.colors, camera)
+    return round(len(subject.novel[0]) / (time.process_time() - start), 1)
 
 
 def coarse_inputs(capture: Capture, body: PackagedBody, fit: Fit, texture: Texture) -> CoarseInputs:
@@ -99,42 +184,33 @@ def _silhouette(body: PackagedBody, fit: Fit, frame: int, capture: Capture) -> N
     return silhouette(turned, body.faces.numpy(), fit["K"].astype(np.float32), height, width)
 
 
-@torch.no_grad()
-def view_scores(capture: Capture, body: PackagedBody, fit: Fit, avatar: Avatar, camera: str) -> tuple[float, float]:
-    """PSNR and silhouette IoU from one camera, each the mean over its true frames."""
-    scores = []
-    for frame in capture.scored_frames():
-        truth = to_float(capture.truth(camera, frame))
-        alpha = truth[3]
-        posed = avatar.pose(body, torch.from_numpy(fit["pose"][frame]), torch.from_numpy(fit["transl"][frame]))
-        made = render(posed.means, posed.covars, posed.opacities, posed.colors, capture.cameras[camera], GREY)
-        x0, y0, x1, y1 = mask_box(alpha)
-        target = truth[:3] * alpha + GREY * (1 - alpha)
-        image = made.images[0].clamp(0, 1)
-        scores.append((psnr(image[:, y0:y1, x0:x1], target[:, y0:y1, x0:x1]), iou(made.alphas[0, 0], alpha)))
-    mean = np.mean(scores, axis=0)
-    return float(mean[0]), float(mean[1])
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("captures", type=Path, help="folder of captures, laid out as their README says")
     parser.add_argument("--json", type=Path, default=None, help="file for the lines; they are printed in any case")
     parser.add_argument("--preset", choices=["draft", "standard"], default="draft")
+    parser.add_argument("--configs", nargs="*", default=list(CONFIGS), choices=CONFIGS)
+    parser.add_argument("--only", default=None, help="name of one capture")
     parser.add_argument("--set", nargs="*", default=[], metavar="STAGE.KNOB=VALUE", help="as in `ahoy run`")
+    parser.add_argument("--sheets", type=Path, default=None, help="folder for pictures of truth and render")
     parser.add_argument("--threads", type=int, default=1)
     options = parser.parse_args(arguments)
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     torch.set_num_threads(options.threads)
     settings = PRESETS[options.preset].with_overrides(options.set)
     body = load_packaged_body()
-    lines = [json.dumps({"machine": machine(), "threads": options.threads})]
+    if options.sheets is not None:
+        options.sheets.mkdir(parents=True, exist_ok=True)
+    lines = [json.dumps({"machine": machine(), "threads": options.threads, "preset": options.preset})]
     for folder in capture_folders(options.captures):
-        row = measure(read_capture(folder), body, settings, " ".join([options.preset, *options.set]))
-        lines.append(json.dumps(row))
-        print(lines[-1], flush=True)
-    if options.json:
-        options.json.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        if options.only not in (None, folder.name):
+            continue
+        subject = Subject(folder, body, settings)
+        for config in options.configs:
+            lines.append(json.dumps({**measure(subject, config, options.sheets), "set": options.set}))
+            print(lines[-1], flush=True)
+            if options.json:
+                options.json.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

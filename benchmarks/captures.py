@@ -56,9 +56,9 @@ class Capture:
         """Numbers of the frames with a true picture from the front camera, in order."""
         return sorted(int(path.stem.rpartition("_")[2]) for path in (self.folder / "gt").glob("front_*.png"))
 
-    def truth(self, camera: str, frame: int) -> NDArray[np.uint8]:
-        """True picture [H,W,4] of the person alone: RGBA uint8, straight alpha."""
-        image = _read_png(self.folder / "gt" / f"{camera}_{frame:03d}.png")
+    def truth(self, camera: str, frame: int, kind: str = "gt") -> NDArray[np.uint8]:
+        """True picture [H,W,4] of the person alone: RGBA uint8, straight alpha; `kind` "novel" is the unseen motion."""
+        image = _read_png(self.folder / kind / f"{camera}_{frame:03d}.png")
         return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA), dtype=np.uint8)
 
 
@@ -95,9 +95,9 @@ def read_capture(folder: Path) -> Capture:
     )
 
 
-def true_fit(capture: Capture, body: PackagedBody) -> dict[str, NDArray[np.generic]]:
+def true_fit(capture: Capture, body: PackagedBody, motion_file: str = "motion.npz") -> dict[str, NDArray[np.generic]]:
     """What the perceive stage's body.npz would hold if it made no error; the world is the capture's."""
-    motion = np.load(capture.folder / "motion.npz")
+    motion = np.load(capture.folder / motion_file)
     phenotype = json.loads(str(motion["phenotype"]))
     betas = torch.tensor([phenotype[name] for name in body.beta_names])
     pose, transl = from_local_ref(body, torch.from_numpy(motion["pose_local_ref"]), betas)

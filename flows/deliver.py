@@ -9,7 +9,7 @@ from flows.pipeline import Outcome
 from tasks.stage import Run
 
 DELIVERED = {
-    "coarse": ("avatar.safetensors", "avatar.json"),
+    "avatar": ("avatar.safetensors", "avatar.json"),
     "animate": ("avatar.ply", "turntable.mp4", "motion.mp4", "turntable.png"),
     "report": ("report.html",),
 }

@@ -43,6 +43,9 @@ class TerminalObserver:
         """Move the stage's bar."""
         self._progress.update(self._bars[stage], completed=done, total=total, note=note)
 
+    def showed(self, stage: str, picture: Path) -> None:
+        """Do nothing: a terminal shows no pictures."""
+
     def finished(self, ref: StageRef, folder: Path) -> None:
         """Close the bar and leave one line that says what the stage cost."""
         self._progress.remove_task(self._bars.pop(ref.stage))

@@ -107,6 +107,14 @@ ARTIFACTS: Mapping[str, tuple[Blob, ...]] = {
         Blob("losses.png"),
         Blob("compare.png"),  # observed frames beside the avatar in their pose
     ),
+    "avatar": (
+        Blob("avatar.safetensors"),
+        Blob("avatar.json"),
+        Blob("losses.parquet", optional=True),  # none where the coarse avatar is kept (ablation A)
+        Blob("losses.png", optional=True),
+        Blob("training.png", optional=True),  # targets above renders, as the training went
+        Blob("compare.png"),
+    ),
     "animate": (
         Blob("turntable.mp4"),
         Blob("motion.mp4"),

@@ -40,7 +40,7 @@ class AnimateConfig(BaseModel):
 
 def run_animate(config: AnimateConfig, ctx: StageContext) -> StageOutput:
     """Render both videos and export the canonical avatar."""
-    avatar, body = load_avatar(ctx.inputs["coarse"]), load_body(ctx.body)
+    avatar, body = load_avatar(ctx.inputs["avatar"]), load_body(ctx.body)
     label = {"comment": avatar.info.synthetic_media, "title": "Ahoy avatar"}
     total = config.turntable_frames + config.motion_frames
     ctx.progress(0, total, "turntable")
@@ -69,4 +69,4 @@ def _roles(config: AnimateConfig) -> Mapping[str, Role]:
     return {"body": packaged_body(), "rasterizer": ours("ahoy_core.splat on the CPU")}
 
 
-ANIMATE = Stage("animate", 2, AnimateConfig, ("coarse",), run_animate, _roles)
+ANIMATE = Stage("animate", 3, AnimateConfig, ("avatar",), run_animate, _roles)

@@ -19,14 +19,16 @@ from ahoy_core.avatar.compare import observed_pairs
 from ahoy_core.avatar.config import CoarseConfig
 from ahoy_core.avatar.files import save_avatar
 from ahoy_core.avatar.supervision import CoarseInputs
+from ahoy_core.avatar.trainer import FullRow
 from ahoy_core.body.load import PACKAGED, load_body
 from ahoy_core.conventions import Cameras
 from ahoy_core.formats.images import contact_sheet, to_float, write_png
 from ahoy_core.formats.npz import load_npz
-from tasks.roles import body_role, ours, packaged_body
+from tasks.roles import body_role, ours, packaged_body, perceptual_network, perceptual_role
 from tasks.stage import Role, Stage, StageContext, StageOutput
 
 PAIRS_SHOWN = 4
+TERMS = ("total", "canonical", "observed", "regularisers", "perceptual")
 
 
 def run_coarse(config: CoarseConfig, ctx: StageContext) -> StageOutput:
@@ -36,11 +38,17 @@ def run_coarse(config: CoarseConfig, ctx: StageContext) -> StageOutput:
     info = AvatarInfo(
         body=inputs.body.name, body_sha256=body_role(ctx.body).weights_sha256, provenance={"source_sha256": source}
     )
-    result = train_coarse(inputs, config, info, lambda step, steps, loss: ctx.progress(step, steps, f"loss {loss:.4f}"))
+    result = train_coarse(
+        inputs,
+        config,
+        info,
+        lambda step, steps, loss: ctx.progress(step, steps, f"loss {loss:.4f}"),
+        perceptual=perceptual_network(),
+    )
     save_avatar(result.avatar, ctx.out)
     pq.write_table(pa.Table.from_pylist([dataclasses.asdict(row) for row in result.losses]), ctx.out / "losses.parquet")
-    _plot(result.losses, ctx.out / "losses.png")
-    _compare(inputs, result.avatar, ctx.out / "compare.png")
+    plot_losses(result.losses, TERMS, ctx.out / "losses.png")
+    compare(inputs, result.avatar, ctx.out / "compare.png")
     return StageOutput(_summary(result), ("compare.png", "losses.png"), metrics=_metrics(result, inputs))
 
 
@@ -95,7 +103,8 @@ def _metrics(result: CoarseResult, inputs: CoarseInputs) -> list[dict[str, Any]]
     ]
 
 
-def _compare(inputs: CoarseInputs, avatar: Avatar, path: Path) -> None:
+def compare(inputs: CoarseInputs, avatar: Avatar, path: Path) -> None:
+    """Draw observed frames beside the avatar in their pose."""
     used = torch.nonzero(inputs.used).flatten().tolist()
     chosen = [used[i * len(used) // PAIRS_SHOWN] for i in range(min(PAIRS_SHOWN, len(used)))]
     pictures: list[np.ndarray] = []
@@ -106,13 +115,14 @@ def _compare(inputs: CoarseInputs, avatar: Avatar, path: Path) -> None:
     write_png(path, contact_sheet(pictures, labels, columns=4, cell=320))
 
 
-def _plot(rows: Sequence[LossRow], path: Path) -> None:
+def plot_losses(rows: Sequence[LossRow] | Sequence[FullRow], terms: Sequence[str], path: Path) -> None:
+    """Draw terms of the objective by step, and the held-out frame's score."""
     matplotlib.use("agg")
     from matplotlib import pyplot
 
     figure, axis = pyplot.subplots(figsize=(7, 3), dpi=110)
     steps = [row.step for row in rows]
-    for name in ("total", "canonical", "observed", "regularisers"):
+    for name in terms:
         axis.plot(steps, [getattr(row, name) for row in rows], label=name, linewidth=1)
     axis.set(xlabel="step", ylabel="loss", yscale="log")
     checks = [(row.step, row.held_out_psnr) for row in rows if not np.isnan(row.held_out_psnr)]
@@ -127,7 +137,7 @@ def _plot(rows: Sequence[LossRow], path: Path) -> None:
 
 
 def _roles(config: CoarseConfig) -> Mapping[str, Role]:
-    return {"body": packaged_body(), "rasterizer": ours("ahoy_core.splat on the CPU")}
+    return {"body": packaged_body(), "rasterizer": ours("ahoy_core.splat on the CPU"), **perceptual_role()}
 
 
-COARSE = Stage("coarse", 2, CoarseConfig, ("ingest", "perceive", "texture"), run_coarse, _roles)
+COARSE = Stage("coarse", 3, CoarseConfig, ("ingest", "perceive", "texture"), run_coarse, _roles)

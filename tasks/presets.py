@@ -19,6 +19,7 @@ PRESETS: Mapping[Preset, Settings] = {
             "texture.canonical_width=192",
             "coarse.map_size=128",
             "coarse.steps=60",
+            "avatar.steps=120",
             "animate.height=256",
             "animate.width=192",
             "animate.turntable_frames=36",
@@ -35,6 +36,7 @@ PRESETS: Mapping[Preset, Settings] = {
             "texture.canonical_width=768",
             "coarse.map_size=512",
             "coarse.steps=200",
+            "avatar.steps=400",
             "animate.height=768",
             "animate.width=576",
         )

@@ -20,10 +20,6 @@ ABSENT = (
     ),
     ("identity: LoRA fine-tuning of a video model (3.2)", "not built yet"),
     ("hallucinate: RF-inversion of coarse renders (3.2)", "not built yet"),
-    (
-        "avatar: pose-dependent maps, pose and camera corrections, head path (3.3)",
-        "not built yet; the avatar is the paper's coarse one",
-    ),
 )
 
 SECTIONS = {
@@ -36,7 +32,11 @@ SECTIONS = {
         "Texture and coverage",
         "What the video shows of the surface, and what was made up from it.",
     ),
-    "coarse": ("Training", "Loss by step, and observed frames beside the avatar in their pose."),
+    "coarse": ("The coarse avatar", "Loss by step, and observed frames beside the avatar in their pose."),
+    "avatar": (
+        "The full avatar",
+        "Trained on the video and on sequences from all sides, with corrections of pose, camera and tone.",
+    ),
     "animate": ("From every side", "Eight views of the avatar."),
 }
 
@@ -47,6 +47,9 @@ CAPTIONS = {
     ("texture", "canonical.png"): "the canonical pose: observed texels only, and the completed body from four sides",
     ("coarse", "compare.png"): "frames of the video beside the whole avatar in the same pose, hidden parts included",
     ("coarse", "losses.png"): "terms of the objective by step, and the score of a frame held out of training",
+    ("avatar", "compare.png"): "frames of the video beside the whole avatar in the same pose, hidden parts included",
+    ("avatar", "training.png"): "as the training went: what supervises above, the avatar below",
+    ("avatar", "losses.png"): "terms of the objective by step, and the score of a frame held out of training",
     ("animate", "turntable.png"): "eight views of the avatar",
 }
 
@@ -116,4 +119,4 @@ def _base64(path: Path) -> str:
     return base64.b64encode(path.read_bytes()).decode()
 
 
-REPORT = Stage("report", 1, ReportConfig, ("ingest", "perceive", "texture", "coarse", "animate"), run_report)
+REPORT = Stage("report", 2, ReportConfig, ("ingest", "perceive", "texture", "coarse", "avatar", "animate"), run_report)

@@ -9,8 +9,11 @@ from importlib import resources
 from pathlib import Path
 
 from ahoy_core.body.load import PACKAGED, body_files
-from tasks.model_files import list_models
+from ahoy_core.roles import FILLINGS, Perceptual
+from tasks.model_files import ModelMissingError, list_models, model_path
 from tasks.role import Role
+
+STLPIPS = "stlpips_alex"
 
 
 @cache
@@ -56,3 +59,17 @@ def networks(names: Iterable[str]) -> Role:
 def ours(name: str) -> Role:
     """A part of this project with no weights of its own; the stage's version stands for it in the key."""
     return Role(name, "Apache-2.0")
+
+
+def perceptual_network() -> Perceptual | None:
+    """Who fills the perceptual role: ST-LPIPS where its weights were pulled, else nobody."""
+    try:
+        network: Perceptual = FILLINGS["perceptual"]["ST-LPIPS"](model_path(STLPIPS))
+    except ModelMissingError:
+        return None
+    return network
+
+
+def perceptual_role() -> dict[str, Role]:
+    """The role's entry for a stage: empty where nobody fills it, so that pulling the weights changes the key."""
+    return {} if perceptual_network() is None else {"perceptual": networks([STLPIPS])}

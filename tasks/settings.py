@@ -9,6 +9,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from ahoy_core.avatar.config import CoarseConfig
+from ahoy_core.avatar.full_config import FullConfig
 from ahoy_core.ingest import IngestConfig
 from ahoy_core.perceive.perceive import PerceiveConfig
 from ahoy_core.texture.texture import TextureConfig
@@ -28,6 +29,7 @@ class Settings(BaseModel):
     perceive: PerceiveConfig = PerceiveConfig()
     texture: TextureConfig = TextureConfig()
     coarse: CoarseConfig = CoarseConfig()
+    avatar: FullConfig = FullConfig()
     animate: AnimateConfig = AnimateConfig()
     report: ReportConfig = ReportConfig()
 

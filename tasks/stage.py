@@ -49,6 +49,9 @@ class Observer(Protocol):
     def progress(self, stage: str, done: int, total: int, note: str) -> None:
         """Called as often as the stage likes."""
 
+    def showed(self, stage: str, picture: Path) -> None:
+        """Called with a PNG of how a long stage is doing, while it runs."""
+
     def finished(self, ref: StageRef, folder: Path) -> None:
         """Called once the artifact is whole in the store; `folder` holds its files."""
 
@@ -79,6 +82,7 @@ class StageContext:
     out: Path
     progress: ProgressFn
     body: str = PACKAGED
+    show: Callable[[Path], None] = lambda picture: None
 
 
 @dataclass(frozen=True)
@@ -232,7 +236,10 @@ def _make(
             def progress(done: int, total: int, note: str = "") -> None:
                 run.observer.progress(stage.name, done, total, note)
 
-            output = stage.run(config, StageContext(folders, manifests, attempt.dir, progress, run.body))
+            def show(picture: Path) -> None:
+                run.observer.showed(stage.name, picture)
+
+            output = stage.run(config, StageContext(folders, manifests, attempt.dir, progress, run.body, show))
             bill = meter.read()
             manifest = attempt.commit(
                 stage_version=stage.version,

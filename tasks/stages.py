@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from tasks.animate import ANIMATE
+from tasks.avatar import AVATAR
 from tasks.coarse import COARSE
 from tasks.ingest import INGEST
 from tasks.perceive import PERCEIVE
@@ -10,4 +11,4 @@ from tasks.report import REPORT
 from tasks.stage import Stage
 from tasks.texture import TEXTURE
 
-STAGES: tuple[Stage, ...] = (INGEST, PERCEIVE, TEXTURE, COARSE, ANIMATE, REPORT)
+STAGES: tuple[Stage, ...] = (INGEST, PERCEIVE, TEXTURE, COARSE, AVATAR, ANIMATE, REPORT)

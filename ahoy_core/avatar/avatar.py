@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import cast
 
 import torch
 from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor
 
-from ahoy_core.avatar.deform import (
-    Canonical,
-    OffsetBounds,
-    apply_offsets,
-    deform,
-    dense_weights,
-    relative_transforms,
-)
+from ahoy_core.avatar.deform import Canonical, OffsetBounds, apply_offsets, deform, dense_weights
+from ahoy_core.avatar.head import expression_basis
+from ahoy_core.avatar.kinematics import Kinematics
+from ahoy_core.avatar.pose_maps import PoseMaps
+from ahoy_core.avatar.posing import PoseDependence
 from ahoy_core.body.model import BodyModel
-from ahoy_core.body.rotations import matrix_to_quaternion, quaternion_to_matrix
+from ahoy_core.body.rotations import axis_angle_to_matrix, matrix_to_quaternion, quaternion_to_matrix
 from ahoy_core.maps.style_unet import StyleUNet, StyleUNetConfig
 from ahoy_core.maps.template import Template
 from ahoy_core.splat import Gaussians
@@ -49,6 +47,21 @@ class Posed:
 
 
 @dataclass(frozen=True)
+class _Ready:
+    """Gaussians for one map pose, with the covariances [N,3,3] and dense skinning weights [N,J] that follow."""
+
+    rotations: Tensor
+    strength: float | None
+    canonical: Canonical
+    covars: Tensor
+    lbs_weights: Tensor
+
+    def serves(self, rotations: Tensor, strength: float | None) -> bool:
+        """Whether another pose has the same map: the root does not count."""
+        return self.strength == strength and torch.equal(self.rotations[1:], rotations[1:])
+
+
+@dataclass(frozen=True)
 class Avatar:
     """A person as Gaussians on a body model.
 
@@ -65,6 +78,8 @@ class Avatar:
         network: The StyleUNet that made the offsets; training goes on from it.
         bounds: The largest offsets that it can make.
         info: Body, licence, provenance, label.
+        posing: What makes a full avatar depend on its pose; None for a coarse one. The Gaussians above are then those
+            of the canonical pose.
     """
 
     means: Tensor
@@ -79,6 +94,7 @@ class Avatar:
     network: StyleUNet
     bounds: OffsetBounds
     info: AvatarInfo
+    posing: PoseDependence | None = None
 
     def __len__(self) -> int:
         return len(self.means)
@@ -119,25 +135,80 @@ class Avatar:
         """[N,J] dense skinning weights."""
         return dense_weights(self.skin_indices, self.skin_weights, self.training_poses.shape[1])
 
-    def pose(self, body: BodyModel, pose: Tensor, transl: Tensor | None = None) -> Posed:
+    @cached_property
+    def _found(self) -> dict[str, object]:
+        """What posing finds once: skeleton, expression basis, Gaussians of the last map pose."""
+        return {}
+
+    def pose(
+        self,
+        body: BodyModel,
+        pose: Tensor,
+        transl: Tensor | None = None,
+        expression: Tensor | None = None,
+        pose_strength: float | None = None,
+    ) -> Posed:
         """Pose the avatar.
 
         Args:
             body: The model named in `info`.
             pose: [J,3] axis-angle, radians, joint 0 in the world.
             transl: [3] metres, world; zero by default.
+            expression: [E] face actions, 0 neutral, 1 the full action; neutral by default.
+            pose_strength: How far a full avatar's map pose is pulled to the training poses, [0,1]; as stored by
+                default. The skeleton always follows `pose`.
 
         Raises:
-            ValueError: If the body is another one, or the pose has another shape or is not finite.
+            ValueError: If the body is another one, or the pose or expression has another shape or is not finite.
         """
         if body.name != self.info.body:
             raise ValueError(f"expected body {self.info.body!r}, got {body.name!r}; convert the motion, not the avatar")
         if tuple(pose.shape) != (body.n_joints, 3) or not bool(torch.isfinite(pose).all()):
             raise ValueError(f"expected a finite pose ({body.n_joints}, 3), got {tuple(pose.shape)}; leave frame out")
+        kinematics = self._kinematics(body)
         place = torch.zeros(3) if transl is None else transl
-        relative = relative_transforms(body, pose[None].to(self.means), self.betas, place[None].to(self.means))[0]
-        means, covars = deform(self.means, self.covars, self.lbs_weights, relative)
-        return Posed(means, covars, self.colors, self.opacities)
+        rotations = axis_angle_to_matrix(pose.to(self.means))
+        relative = kinematics.relative(rotations[None], place[None].to(self.means))[0]
+        ready = self._ready(kinematics, rotations, pose_strength)
+        means = ready.canonical.means
+        if expression is not None:
+            means = means + self._expressed(body, expression)
+        means, covars = deform(means, ready.covars, ready.lbs_weights, relative)
+        return Posed(means, covars, ready.canonical.colors, ready.canonical.opacities)
+
+    def _kinematics(self, body: BodyModel) -> Kinematics:
+        if "kinematics" not in self._found:
+            self._found["kinematics"] = Kinematics.of(body, self.betas)
+        return cast(Kinematics, self._found["kinematics"])
+
+    def _ready(self, kinematics: Kinematics, rotations: Tensor, strength: float | None) -> _Ready:
+        """What skinning takes; a full avatar's is kept until the next map pose."""
+        last = cast("_Ready | None", self._found.get("ready"))
+        if last is not None and (self.posing is None or last.serves(rotations, strength)):
+            return last
+        if self.posing is None:
+            turned = quaternion_to_matrix(self.quats)
+            made = Canonical(self.means, turned, self.scales, self.opacities, self.colors, self.skin_weights)
+            ready = _Ready(rotations, strength, made, self.covars, self.lbs_weights)
+        else:
+            maps = cast(
+                PoseMaps,
+                self._found.setdefault("maps", PoseMaps(self.template, kinematics, self.posing.reduction)),
+            )
+            made = self.posing.gaussians(maps, self.network, self.bounds, rotations, strength)
+            dense = dense_weights(self.skin_indices, made.skin_weights, kinematics.n_joints)
+            ready = _Ready(rotations, strength, made, made.covars(), dense)
+        self._found["ready"] = ready
+        return ready
+
+    def _expressed(self, body: BodyModel, expression: Tensor) -> Tensor:
+        """Canonical displacements [N,3] of face actions [E]."""
+        if tuple(expression.shape) != (body.n_expressions,) or not bool(torch.isfinite(expression).all()):
+            raise ValueError(f"expected {body.n_expressions} finite face actions, got {tuple(expression.shape)}")
+        if "expressions" not in self._found:
+            self._found["expressions"] = expression_basis(body, self.betas, self.template)
+        basis = cast(Tensor, self._found["expressions"])
+        return torch.einsum("e,enk->nk", expression.to(basis), basis)
 
     def to_gaussians(self, posed: Posed | None = None) -> Gaussians:
         """Gaussians for export, canonical or posed.
@@ -188,7 +259,45 @@ def bake(
         training_poses: [T,J,3].
         info: What the file shall say.
     """
-    canonical: Canonical = apply_offsets(template, template.gather(network(template.maps())), bounds)
+    canonical = apply_offsets(template, template.gather(network(template.maps())), bounds)
+    return _baked(canonical, template, network, bounds, betas, training_poses, info)
+
+
+@torch.no_grad()
+def bake_full(
+    maps: PoseMaps,
+    network: StyleUNet,
+    bounds: OffsetBounds,
+    posing: PoseDependence,
+    betas: Tensor,
+    training_poses: Tensor,
+    info: AvatarInfo,
+) -> Avatar:
+    """A pose-dependent avatar; its stored Gaussians are those of the canonical pose.
+
+    Args:
+        maps: Maker of the pose maps.
+        network: Trained StyleUNet on them.
+        bounds: Largest offsets.
+        posing: The pose-dependent part.
+        betas: [S] shape.
+        training_poses: [T,J,3].
+        info: What the file shall say.
+    """
+    canonical = posing.gaussians(maps, network, bounds, maps.kinematics.canonical)
+    avatar = _baked(canonical, maps.template, network, bounds, betas, training_poses, info)
+    return replace(avatar, posing=posing)
+
+
+def _baked(
+    canonical: Canonical,
+    template: Template,
+    network: StyleUNet,
+    bounds: OffsetBounds,
+    betas: Tensor,
+    training_poses: Tensor,
+    info: AvatarInfo,
+) -> Avatar:
     return Avatar(
         means=canonical.means,
         quats=matrix_to_quaternion(canonical.rotations),

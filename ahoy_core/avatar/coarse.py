@@ -19,6 +19,7 @@ from ahoy_core.avatar.supervision import CanonicalViews, CoarseInputs, Frame, ca
 from ahoy_core.maps.style_unet import StyleUNet
 from ahoy_core.maps.template import Template, build_template
 from ahoy_core.metrics import INPUT_VIEW, input_view_pair, psnr, ssim
+from ahoy_core.metrics.perceptual import Perceptual, patch_distance
 from ahoy_core.texture.texels import sample_atlas
 
 Progress = Callable[[int, int, float], None]
@@ -38,6 +39,7 @@ class LossRow:
     canonical: float
     observed: float
     regularisers: float
+    perceptual: float
     held_out_psnr: float
 
 
@@ -73,7 +75,12 @@ def textured_template(inputs: CoarseInputs, map_size: int) -> Template:
 
 
 def train_coarse(
-    inputs: CoarseInputs, config: CoarseConfig, info: AvatarInfo, progress: Progress | None = None
+    inputs: CoarseInputs,
+    config: CoarseConfig,
+    info: AvatarInfo,
+    progress: Progress | None = None,
+    *,
+    perceptual: Perceptual | None = None,
 ) -> CoarseResult:
     """Train the coarse avatar (paper section 3.1, equation 1).
 
@@ -85,6 +92,7 @@ def train_coarse(
         config: Sizes, steps, weights, seed.
         info: What the avatar's file shall say.
         progress: Called after every step.
+        perceptual: The perceptual role; None leaves that loss out.
 
     Returns:
         The avatar of the step with the best held-out score (the last step where no frame is held out).
@@ -99,7 +107,7 @@ def train_coarse(
     if held_out is None:
         notes.append(f"no frame held out: {len(frames)} usable, more than {_MIN_FRAMES_FOR_HOLD_OUT} needed")
     template = textured_template(inputs, config.map_size)
-    run = _Run(template, frames, views, held_out, config, inputs.body.n_joints)
+    run = _Run(template, frames, views, held_out, config, inputs.body.n_joints, perceptual)
     run.train(progress)
     poses = torch.stack([inputs.pose[frame.number] for frame in frames]) if frames else inputs.pose[:0]
     avatar = bake(template, run.network, config.bounds, inputs.betas, poses.float(), info)
@@ -122,7 +130,9 @@ class _Run:
         held_out: Frame | None,
         config: CoarseConfig,
         n_joints: int,
+        perceptual: Perceptual | None,
     ) -> None:
+        self.perceptual = perceptual if config.weights.perceptual > 0 else None
         self.template, self.frames, self.held_out = template, frames, held_out
         self.views = weigh_head(views, template, config.weights.head)
         self.config, self.n_joints = config, n_joints
@@ -153,7 +163,7 @@ class _Run:
             check = self.held_out is not None and (step % config.check_every == 0 or step == config.steps)
             score = self.score()[0] if check else _NAN
             values = [float(x.detach()) for x in (total, *terms)]
-            self.rows.append(LossRow(step, values[0], values[1], values[2], values[3], score))
+            self.rows.append(LossRow(step, values[0], values[1], values[2], values[3], values[4], score))
             if progress is not None:
                 progress(step, config.steps, self.rows[-1].total)
             if score > self.best[0]:
@@ -167,23 +177,26 @@ class _Run:
         if self.held_out is not None:
             self.network.load_state_dict(self.best[1])
 
-    def _losses(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Canonical term, observed term and regularisers of a random batch of views, weighted."""
+    def _losses(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Canonical term, observed term, regularisers and perceptual term of a random batch of views, weighted."""
         config = self.config
         canonical = self._canonical()
         covars = canonical.covars()
         lbs_weights = dense_weights(self.template.skin_indices, canonical.skin_weights, self.n_joints)
         first = self._view_loss(canonical, covars, self._draw(len(self.views.cameras), config.views_per_step))
-        second = first.new_zeros(())
+        second, fourth = first.new_zeros(()), first.new_zeros(())
         chosen = self._draw(len(self.frames), config.frames_per_step)
         for number in chosen:
             frame = self.frames[number]
             means, posed = deform(canonical.means, covars, lbs_weights, frame.relative)
             rendered = render(means, posed, canonical.opacities, canonical.colors, frame.camera)
             second = second + self._frame_loss(rendered, frame) / len(chosen)
+            if self.perceptual is not None and number == chosen[0]:
+                image, side = rendered.images[0], config.patch
+                fourth = patch_distance(self.perceptual, image, frame.target, frame.weight, side, self.generator)
         weights = config.weights
         third = regularisers(canonical, self.template, self.around, weights)
-        return weights.canonical * first, weights.observed * second, third
+        return weights.canonical * first, weights.observed * second, third, weights.perceptual * fourth
 
     def _frame_loss(self, rendered: Rendered, frame: Frame) -> Tensor:
         weights, alpha = self.config.weights, rendered.alphas[0]

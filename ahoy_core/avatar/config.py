@@ -20,6 +20,7 @@ class CoarseConfig(BaseModel):
     frames_per_step: int = Field(default=3, ge=1, description="observed frames per network pass")
     max_frames: int = Field(default=48, ge=1, description="observed frames kept, evenly spread")
     learning_rate: float = Field(default=8e-3, gt=0)
+    patch: int = Field(default=64, ge=32, description="side of the perceptual loss's patch, pixels")
     check_every: int = Field(default=25, ge=1, description="steps between two looks at the held-out frame")
     patience: int = Field(
         default=2, ge=1, description="checks in a row that may be worse than the best before it stops"

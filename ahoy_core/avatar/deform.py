@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import cast
 
 import torch
 from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor
 
-from ahoy_core.body.canonical import canonical_pose
 from ahoy_core.body.lbs import blend_transforms
-from ahoy_core.body.model import BodyModel
 from ahoy_core.body.rotations import axis_angle_to_matrix
 from ahoy_core.maps.template import Template
 
@@ -110,35 +105,24 @@ def dense_weights(indices: Tensor, weights: Tensor, n_joints: int) -> Tensor:
     return weights.new_zeros(len(weights), n_joints).scatter_add(1, indices, weights)
 
 
-@lru_cache(maxsize=2)
-def _canonical_pose(body: Hashable) -> Tensor:
-    """The canonical pose of a body, which costs more to find than a frame's other transforms together."""
-    return canonical_pose(cast(BodyModel, body))
-
-
-def relative_transforms(body: BodyModel, pose: Tensor, betas: Tensor, transl: Tensor) -> Tensor:
-    """What takes the canonical body to a pose, joint by joint: T_j(pose) T_j(canonical)^-1.
+def deform(means: Tensor, covars: Tensor, lbs_weights: Tensor, relative: Tensor) -> tuple[Tensor, Tensor]:
+    """D of paper section 3.1 for one pose: `deform_each` without its leading dimension.
 
     Args:
-        body: The body model.
-        pose: [B,J,3] axis-angle, radians.
-        betas: [S] shape, the same for both.
-        transl: [B,3] metres, world.
+        means: [N,3] canonical, metres.
+        covars: [N,3,3] canonical, metres².
+        lbs_weights: [N,J] rows sum to 1.
+        relative: [J,4,4] from `Kinematics.relative`.
 
     Returns:
-        [B,J,4,4]; the identity where pose is the canonical pose and transl is 0.
+        Posed means [N,3] and covars [N,3,3], world.
     """
-    shapes = betas.to(pose)[None]
-    start = body(_canonical_pose(cast(Hashable, body)).to(pose)[None], shapes, torch.zeros_like(transl[:1])).transforms
-    posed = body(pose, shapes.expand(len(pose), -1), transl).transforms
-    rotation = start[:, :, :3, :3].transpose(-1, -2)
-    shift = -(rotation @ start[:, :, :3, 3:])
-    inverse = torch.cat([torch.cat([rotation, shift], -1), start[:, :, 3:]], -2)
-    return posed @ inverse
+    posed, turned = deform_each(means, covars, lbs_weights, relative[None])
+    return posed[0], turned[0]
 
 
-def deform(means: Tensor, covars: Tensor, lbs_weights: Tensor, relative: Tensor) -> tuple[Tensor, Tensor]:
-    """D of paper section 3.1: linear blend skinning of Gaussians.
+def deform_each(means: Tensor, covars: Tensor, lbs_weights: Tensor, relative: Tensor) -> tuple[Tensor, Tensor]:
+    """Linear blend skinning of Gaussians in several poses: one blend of the weights serves all of them.
 
     Covariances follow the linear part A of the blend, A Sigma A^T: polynomial, so with gradients everywhere, where
     the polar rotation of A would jump at a twist of 180 degrees (docs/avatar.md).
@@ -147,12 +131,12 @@ def deform(means: Tensor, covars: Tensor, lbs_weights: Tensor, relative: Tensor)
         means: [N,3] canonical, metres.
         covars: [N,3,3] canonical, metres².
         lbs_weights: [N,J] rows sum to 1.
-        relative: [J,4,4] from `relative_transforms`.
+        relative: [B,J,4,4] from `Kinematics.relative`.
 
     Returns:
-        Posed means [N,3] and covars [N,3,3], world.
+        Posed means [B,N,3] and covars [B,N,3,3], world.
     """
-    blend = blend_transforms(lbs_weights, relative[None])[0]
-    linear = blend[:, :3, :3]
-    posed = (linear @ means[:, :, None])[:, :, 0] + blend[:, :3, 3]
-    return posed, linear @ covars @ linear.transpose(1, 2)
+    blend = blend_transforms(lbs_weights, relative)
+    linear = blend[..., :3, :3]
+    posed = (linear @ means[:, :, None])[..., 0] + blend[..., :3, 3]
+    return posed, linear @ covars @ linear.transpose(-1, -2)

@@ -12,12 +12,15 @@ from safetensors.torch import load_file, save_file
 
 from ahoy_core.avatar.avatar import Avatar, AvatarInfo
 from ahoy_core.avatar.deform import OffsetBounds
+from ahoy_core.avatar.posing import PoseDependence
 from ahoy_core.maps.style_unet import StyleUNet, StyleUNetConfig
 from ahoy_core.maps.template import Template
 
-FORMAT = 1
+FORMAT = 2
+_READ = (1, 2)  # 1 has no pose-dependent avatars
 TENSORS, DESCRIPTION = "avatar.safetensors", "avatar.json"
 _GAUSSIANS = ("means", "quats", "scales", "opacities", "colors", "skin_weights", "betas", "training_poses")
+_POSING = ("base", "map_rotations")
 _TEMPLATE = tuple(field.name for field in fields(Template) if field.name not in ("map_size", "pitch"))
 
 
@@ -34,6 +37,8 @@ def save_avatar(avatar: Avatar, folder: Path) -> tuple[Path, Path]:
     folder.mkdir(parents=True, exist_ok=True)
     tensors = {name: getattr(avatar, name) for name in _GAUSSIANS}
     tensors |= {f"template.{name}": getattr(avatar.template, name) for name in _TEMPLATE}
+    if avatar.posing is not None:
+        tensors |= {f"posing.{name}": getattr(avatar.posing, name) for name in _POSING}
     tensors |= {f"network.{name}": value for name, value in avatar.network.state_dict().items()}
     description = {
         "format": FORMAT,
@@ -45,6 +50,9 @@ def save_avatar(avatar: Avatar, folder: Path) -> tuple[Path, Path]:
         "pitch": avatar.template.pitch,
         "network": avatar.network.config.model_dump(),
         "bounds": avatar.bounds.model_dump(),
+        "posing": None
+        if avatar.posing is None
+        else {name: getattr(avatar.posing, name) for name in ("reduction", "components", "strength")},
     }
     label = {"synthetic_media": avatar.info.synthetic_media}
     save_file({name: value.detach().contiguous() for name, value in tensors.items()}, folder / TENSORS, label)
@@ -70,9 +78,13 @@ def load_avatar(folder: Path) -> Avatar:
         tensors = load_file(folder / TENSORS)
     except (json.JSONDecodeError, UnicodeDecodeError, SafetensorError) as error:
         raise ValueError(f"expected an avatar in {folder}, got a damaged file ({error}); make it again") from error
-    if description.get("format") != FORMAT:
-        raise ValueError(f"expected avatar format {FORMAT}, got {description.get('format')}; update this program")
-    missing = [name for name in (*_GAUSSIANS, *(f"template.{name}" for name in _TEMPLATE)) if name not in tensors]
+    if description.get("format") not in _READ:
+        raise ValueError(
+            f"expected avatar format {FORMAT} or older, got {description.get('format')}; update this program"
+        )
+    described = description.get("posing")
+    wanted = [*_GAUSSIANS, *(f"template.{n}" for n in _TEMPLATE), *(f"posing.{n}" for n in _POSING if described)]
+    missing = [name for name in wanted if name not in tensors]
     if missing:
         raise ValueError(f"expected tensors {missing} in {folder / TENSORS}, found none; make the avatar again")
     network = StyleUNet(StyleUNetConfig(**description["network"]), torch.Generator().manual_seed(0))
@@ -84,5 +96,13 @@ def load_avatar(folder: Path) -> Avatar:
     )
     info = AvatarInfo(**{name: description[name] for name in AvatarInfo.model_fields})
     bounds = OffsetBounds(**description["bounds"])
-    gaussians = {name: tensors[name] for name in _GAUSSIANS}
-    return Avatar(template=template, network=network, bounds=bounds, info=info, **gaussians)
+    return Avatar(
+        template=template,
+        network=network,
+        bounds=bounds,
+        info=info,
+        posing=PoseDependence(tensors["posing.base"], tensors["posing.map_rotations"], **described)
+        if described
+        else None,
+        **{name: tensors[name] for name in _GAUSSIANS},
+    )

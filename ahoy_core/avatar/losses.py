@@ -29,6 +29,7 @@ class LossWeights(BaseModel):
     alpha: float = Field(default=0.2, ge=0, description="L1 of the canonical views' alpha")
     empty: float = Field(default=0.3, ge=0, description="alpha of observed pixels that are surely background")
     solid: float = Field(default=0.2, ge=0, description="missing alpha where the person is seen")
+    perceptual: float = Field(default=0.1, ge=0, description="ST-LPIPS of a patch of one picture a step")
     offset: float = Field(default=0.02, ge=0, description="squared offsets over 1 cm")
     strain: float = Field(default=0.1, ge=0, description="squared change of the offset over the way to a neighbour")
     scale: float = Field(default=0.01, ge=0, description="squared log scale factors")
@@ -36,6 +37,7 @@ class LossWeights(BaseModel):
         default=0.2, ge=0, description="squared log scale factors of axes that grew, on top of `scale`"
     )
     scale_change: float = Field(default=0.05, ge=0, description="squared difference of log scale factors of neighbours")
+    color_change: float = Field(default=0.0, ge=0, description="squared difference of colour offsets of neighbours")
     lbs: float = Field(default=1.0, ge=0, description="squared distance to the body's skinning weights (section 3.3)")
 
 
@@ -131,5 +133,6 @@ def regularisers(canonical: Canonical, template: Template, around: Neighbourhood
         + weights.scale * growth.square().mean()
         + weights.growth * growth.clamp(min=0).square().mean()
         + weights.scale_change * around.change(growth)
+        + weights.color_change * around.change(canonical.colors - template.colors)
         + weights.lbs * skin
     )

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from ahoy_core.avatar.deform import relative_transforms
+from ahoy_core.avatar.kinematics import relative_transforms
 from ahoy_core.avatar.losses import LossWeights, canonical_weight
 from ahoy_core.body.model import BodyModel
 from ahoy_core.conventions import GREY, Cameras

@@ -87,13 +87,17 @@ class Template:
                 raise ValueError(f"expected {name} of shape {shape}, got {tuple(value.shape)}; sample the atlas at uv")
         return replace(self, colors=colors.to(self.means), observed=observed.to(self.means).clamp(0, 1))
 
-    def maps(self) -> Tensor:
+    def maps(self, positions: Tensor | None = None) -> Tensor:
         """The network's input, [1,14,S,S]: seven channels for the front, then for the back.
 
-        Position (-1..1 over the body's box), colour (-1..1), observed; zero where there is no Gaussian.
+        Position (-1..1 over the canonical body's box), colour (-1..1), observed; zero where there is no Gaussian.
+
+        Args:
+            positions: [N,3] of the Gaussians in another pose, metres; the canonical ones by default.
         """
         low, high = self.means.amin(0), self.means.amax(0)
-        position = (self.means - (low + high) / 2) / ((high - low).max() / 2).clamp(min=1e-6)
+        points = self.means if positions is None else positions
+        position = (points - (low + high) / 2) / ((high - low).max() / 2).clamp(min=1e-6)
         values = torch.cat([position, self.colors * 2 - 1, self.observed[:, None]], 1)
         maps = values.new_zeros(2, self.map_size, self.map_size, IN_CHANNELS_PER_SIDE)
         maps[tuple(self.pixels.T)] = values

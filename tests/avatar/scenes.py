@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from ahoy_core.avatar import CoarseConfig, CoarseInputs
-from ahoy_core.avatar.deform import deform, dense_weights, relative_transforms
+from ahoy_core.avatar.deform import deform, dense_weights
+from ahoy_core.avatar.kinematics import relative_transforms
 from ahoy_core.avatar.render import render
 from ahoy_core.body.canonical import canonical_pose
 from ahoy_core.body.model import BodyModel

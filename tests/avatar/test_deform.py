@@ -12,8 +12,8 @@ from ahoy_core.avatar.deform import (
     deform,
     dense_weights,
     offset_channels,
-    relative_transforms,
 )
+from ahoy_core.avatar.kinematics import relative_transforms
 from ahoy_core.body.canonical import canonical_pose
 from ahoy_core.body.rotations import axis_angle_to_matrix
 from ahoy_core.splat import oracle

@@ -18,7 +18,7 @@ from storage_schema.store import ArtifactStore
 from storage_schema.tables import Tables
 from tests.e2e.conftest import SmallRun, ahoy
 
-STAGES = ["ingest", "perceive", "texture", "coarse", "animate", "report"]
+STAGES = ["ingest", "perceive", "texture", "coarse", "avatar", "animate", "report"]
 
 
 def _rows(run: SmallRun, table: str) -> list[dict]:
@@ -39,7 +39,7 @@ def test_a_second_run_finds_every_stage_in_the_store(small_run: SmallRun) -> Non
 def test_a_changed_knob_reruns_its_stage_and_what_depends_on_it(small_run: SmallRun) -> None:
     output = small_run.again(knobs=["animate.motion_frames=4"]).output
     found = [line.split()[0] for line in output.splitlines() if "found in the store" in line]
-    assert found == STAGES[:4]
+    assert found == STAGES[:5]
 
 
 def test_the_report_is_one_file_that_asks_the_network_for_nothing(small_run: SmallRun) -> None:
@@ -50,6 +50,8 @@ def test_the_report_is_one_file_that_asks_the_network_for_nothing(small_run: Sma
         "was invented",
         "turntable",
         "not built yet",
+        "The full avatar",
+        "ablation B2",
         "peak memory",
         "Anny",
         "mediapipe",

@@ -13,7 +13,7 @@ from flows.process_video import process_video
 from flows.request import VideoRequest
 from tests.e2e.conftest import SMALL, SmallRun, demo_clip, models, small_run  # noqa: F401  (session fixtures)
 
-STAGES = {"ingest", "perceive", "texture", "coarse", "animate", "report"}
+STAGES = {"ingest", "perceive", "texture", "coarse", "avatar", "animate", "report"}
 
 
 @pytest.fixture(scope="session")

@@ -1,0 +1,148 @@
+"""Stage `avatar`: coarse avatar and supervision -> the full avatar (paper 3.3, equations 5-9)."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import platformdirs
+import pyarrow as pa
+import pyarrow.parquet as pq
+import torch
+
+from ahoy_core.avatar.avatar import Avatar, AvatarInfo
+from ahoy_core.avatar.coarse_renders import coarse_sequences
+from ahoy_core.avatar.face_views import observed_faces
+from ahoy_core.avatar.files import load_avatar, save_avatar
+from ahoy_core.avatar.full import FullResult, train_full
+from ahoy_core.avatar.full_config import FullConfig
+from ahoy_core.avatar.full_inputs import FullInputs
+from ahoy_core.avatar.kinematics import Kinematics
+from ahoy_core.avatar.supervision import CoarseInputs
+from ahoy_core.body.canonical import canonical_pose
+from ahoy_core.formats.images import contact_sheet, to_uint8, write_png
+from ahoy_core.formats.npz import load_npz
+from tasks.coarse import compare, load_inputs, plot_losses
+from tasks.roles import ours, packaged_body, perceptual_network, perceptual_role
+from tasks.stage import Role, Stage, StageContext, StageOutput
+
+PREVIEWS_SHOWN = 4
+COARSE_MAP_POSES = 3  # of coarse renders: the canonical pose and two of the video's that are far from it
+TERMS = ("total", "body", "observed", "head", "perceptual", "regularisers", "corrections")
+
+
+def run_avatar(config: FullConfig, ctx: StageContext) -> StageOutput:
+    """Train, save the avatar, and draw losses, pictures of the training and the comparison with the video."""
+    coarse = load_avatar(ctx.inputs["coarse"])
+    observed = load_inputs(ctx.inputs["ingest"], ctx.inputs["perceive"], ctx.inputs["texture"], ctx.body)
+    if not config.switches.full:
+        return _keep_coarse(coarse, observed, ctx)
+    inputs, notes = _full_inputs(coarse, observed, config, ctx.inputs["perceive"])
+    previews: list[tuple[int, np.ndarray]] = []
+    checkpoint = checkpoint_path(config, ctx)
+    result = train_full(
+        inputs,
+        config,
+        AvatarInfo(**coarse.info.model_dump()),
+        lambda step, steps, loss: ctx.progress(step, steps, f"loss {loss:.4f}"),
+        perceptual=perceptual_network(),
+        preview=lambda step, picture: _show(previews, step, picture, ctx),
+        checkpoint=checkpoint,
+    )
+    save_avatar(result.avatar, ctx.out)
+    checkpoint.unlink(missing_ok=True)
+    _draw(result, observed, ctx.out)
+    return StageOutput(_summary(result, notes), ("compare.png", "training.png", "losses.png"), metrics=_metrics(result))
+
+
+def checkpoint_path(config: FullConfig, ctx: StageContext) -> Path:
+    """Where a killed run's successor looks: a file of this configuration and these inputs in the user's cache."""
+    parts = [config.model_dump_json(), *(f"{name} {m.content_hash}" for name, m in sorted(ctx.manifests.items()))]
+    name = hashlib.sha256("\n".join(parts).encode()).hexdigest()[:32]
+    return Path(platformdirs.user_cache_dir("ahoy", appauthor=False)) / "checkpoints" / f"{name}.pt"
+
+
+def _full_inputs(
+    coarse: Avatar, observed: CoarseInputs, config: FullConfig, perceive: Path
+) -> tuple[FullInputs, list[str]]:
+    """What equation 9 asks for; the hallucinated sequences are coarse renders as long as no prior repaints them."""
+    template = coarse.template
+    with torch.no_grad():
+        base = template.gather(coarse.network(template.maps()))
+    expression = torch.from_numpy(load_npz(perceive / "body.npz", ["expression"])["expression"])
+    kinematics = Kinematics.of(observed.body, observed.betas.float())
+    faces, reason = observed_faces(observed, template, kinematics, expression)
+    if config.switches.supervise == "none":
+        return FullInputs(observed, template, base, (), faces, reason), ["no sequences: switched off (B1)"]
+    sequences = coarse_sequences(coarse, observed.body, _map_poses(observed))
+    note = (
+        "no prior has repainted the coarse renders (section 3.2): they supervise as they are, weighted by what the "
+        "video never showed (ablation B2's data)"
+    )
+    return FullInputs(observed, template, base, sequences, faces, reason), [note]
+
+
+def _map_poses(observed: CoarseInputs) -> torch.Tensor:
+    """The canonical pose, and fitted poses of the video that are far from it and from each other: [G,J,3]."""
+    still = canonical_pose(observed.body)[None].float()
+    pool = observed.pose[observed.used & torch.isfinite(observed.pose).flatten(1).all(1)].float()
+    chosen = still
+    while len(chosen) < COARSE_MAP_POSES and len(pool):
+        away = torch.cdist(pool[:, 1:].flatten(1), chosen[:, 1:].flatten(1)).amin(1)
+        chosen = torch.cat([chosen, pool[int(away.argmax())][None]])
+    return chosen
+
+
+def _keep_coarse(coarse: Avatar, observed: CoarseInputs, ctx: StageContext) -> StageOutput:
+    save_avatar(coarse, ctx.out)
+    compare(observed, coarse, ctx.out / "compare.png")
+    note = "the coarse avatar is kept as it is: switched off (ablation A)"
+    return StageOutput({"facts": {"gaussians": len(coarse)}, "notes": [note]}, ("compare.png",))
+
+
+def _show(previews: list[tuple[int, np.ndarray]], step: int, picture: torch.Tensor, ctx: StageContext) -> None:
+    """Keep a picture of the training, and put the latest ones where a person can see them."""
+    previews.append((step, to_uint8(picture)))
+    apart = max(1, len(previews) // PREVIEWS_SHOWN)
+    chosen = [*previews[::apart][: PREVIEWS_SHOWN - 1], previews[-1]]
+    sheet = contact_sheet([p for _, p in chosen], [f"step {n}" for n, _ in chosen], columns=2)
+    write_png(ctx.out / "training.png", sheet)
+    ctx.show(ctx.out / "training.png")
+
+
+def _draw(result: FullResult, observed: CoarseInputs, out: Path) -> None:
+    pq.write_table(pa.Table.from_pylist([dataclasses.asdict(row) for row in result.losses]), out / "losses.parquet")
+    plot_losses(result.losses, TERMS, out / "losses.png")
+    compare(observed, result.avatar, out / "compare.png")
+
+
+def _summary(result: FullResult, notes: list[str]) -> dict[str, Any]:
+    share = result.avatar.observed_share
+    facts: dict[str, Any] = {"gaussians": len(result.avatar), "steps": len(result.losses)}
+    if (score := result.held_out) is not None:
+        facts["held-out frame, PSNR"] = f"{score.psnr_after:.2f} dB ({score.psnr_before:.2f} for the coarse avatar)"
+        facts["held-out frame, SSIM"] = f"{score.ssim_after:.3f} ({score.ssim_before:.3f} for the coarse avatar)"
+        facts["protocol"] = score.protocol
+    for name, value in result.corrections.items():
+        facts[f"largest {name} correction"] = f"{value:.0%} of its bound"
+    invented = f"{share:.0%} of the surface was observed in the video, {1 - share:.0%} was invented."
+    return {"facts": facts, "notes": [*notes, *result.notes], "invented": invented, "observed_share": share}
+
+
+def _metrics(result: FullResult) -> list[dict[str, Any]]:
+    score = result.held_out
+    if score is None:
+        return []
+    same = {"protocol": "input-view", "protocol_id": score.protocol, "region": "mask box", "camera": "observed"}
+    return [{**same, "frame": score.frame, "config": "full", "psnr": score.psnr_after, "ssim": score.ssim_after}]
+
+
+def _roles(config: FullConfig) -> Mapping[str, Role]:
+    return {"body": packaged_body(), "rasterizer": ours("ahoy_core.splat on the CPU"), **perceptual_role()}
+
+
+AVATAR = Stage("avatar", 1, FullConfig, ("ingest", "perceive", "texture", "coarse"), run_avatar, _roles)
