@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from rich.console import Console
 from rich.markup import escape
 
-from flows import models_cli, plan_cli, store_cli
+from flows import export_cli, models_cli, plan_cli, render_cli, store_cli, view_cli
 from storage_schema.secrets import RedactSecrets
 
 if TYPE_CHECKING:
@@ -22,6 +22,9 @@ app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_
 app.add_typer(models_cli.app, name="models")
 app.add_typer(store_cli.app, name="store")
 app.command("plan")(plan_cli.plan)
+app.command()(render_cli.render)
+app.command()(export_cli.export)
+app.command()(view_cli.view)
 
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
