@@ -174,9 +174,9 @@ class Viewer:
         says = facts(self.avatar)
         gui.add_markdown(f"**{says['synthetic_media']}** Invented: {says['invented_share']:.0%} of the surface.")
         if len(self.viewed.avatars) > 1:
-            self._chooser(gui.add_dropdown("avatar", tuple(self.viewed.avatars), self.name), "name")
-        self._chooser(gui.add_dropdown("colours", MODES, self.mode), "mode")
-        self._chooser(gui.add_dropdown("motion", BUILT_IN, self.motion_name), "motion_name")
+            self._chooser(gui.add_dropdown("avatar", tuple(self.viewed.avatars), initial_value=self.name), "name")
+        self._chooser(gui.add_dropdown("colours", MODES, initial_value=self.mode), "mode")
+        self._chooser(gui.add_dropdown("motion", BUILT_IN, initial_value=self.motion_name), "motion_name")
         self.playing = gui.add_checkbox("play", True)
         with gui.add_folder("expression"):
             for action in _SHOWN_ACTIONS:

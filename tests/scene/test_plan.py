@@ -55,7 +55,7 @@ CALLS = {
         lambda: (wall(1.0), puppet(), Shot(camera((0.0, -4.0, 1.0), (0.0, 0.0, 1.0)))),
     ),
     "depth_of_field": (
-        lambda: (room(), puppet(), Shot(camera(), aperture=0.1)),
+        lambda: (room(), puppet(), Shot(camera(), aperture=0.3)),
         lambda: (room(), puppet(), Shot(camera(), aperture=0.001)),
     ),
     "motion_blur": (
@@ -107,7 +107,7 @@ class Counting(TorchDispatchMode):
 
 def plain() -> tuple[Scene, Puppet, Shot]:
     """Content that calls for nothing: a wall behind a person who stands still, filmed sharply."""
-    return wall(1.0), puppet(), Shot(camera((0.0, -4.0, 1.2), (0.0, 0.0, 1.2)), shutter=0.0)
+    return wall(2.0), puppet(), Shot(camera((0.0, -4.0, 1.2), (0.0, 0.0, 1.2)), shutter=0.0)
 
 
 def test_what_is_off_makes_no_call_and_no_tensor():

@@ -84,6 +84,7 @@ def test_motion_expression_mode_and_avatar_change_what_is_sent(viewer: Viewer):
         viewer.refresh()
         return viewer.handle.centers.copy(), viewer.handle.rgbs.copy()
 
+    viewer.playing.value = False
     still, plain = sent()
     viewer.name, viewer.mode = "coarse", "coverage"
     assert not np.array_equal(sent()[1], plain)

@@ -21,7 +21,7 @@ from ahoy_core.scene.shot import Content, Shot
 
 MOST_SAMPLES = 16
 # Pixels: less blur than this is less than the rasterizer's own; between samples a gap this wide does not show.
-_LEAST_BLUR, _GAP = 1.0, 1.5
+_LEAST_BLUR, _GAP, _LENS_GAP = 1.0, 1.5, 1.0
 _GOLDEN = math.pi * (3 - math.sqrt(5))
 
 
@@ -93,7 +93,7 @@ def motion_pixels(content: Content) -> float:
 
 
 def camera_pixels(content: Content) -> float:
-    """The largest way, in pixels, that the picture's middle depth goes by the camera's motion in one exposure."""
+    """The largest way, in pixels, that things near and far go by the camera's motion in one exposure."""
     shot = content.shot
     if shot.still or len(shot.cameras) < 2:
         return 0.0
@@ -102,7 +102,9 @@ def camera_pixels(content: Content) -> float:
     for frame in content.moments:
         other = min(frame + 1, len(shot.cameras) - 1)
         view = torch.linalg.inv(shot.cameras.viewmats[frame])
-        corners = torch.tensor([[x, y, at, 1.0] for x in (-0.3 * at, 0.3 * at) for y in (-0.3 * at, 0.3 * at)])
+        corners = torch.tensor(
+            [[x * z, y * z, z, 1.0] for z in (0.5 * at, at, 2 * at) for x in (-0.3, 0.3) for y in (-0.3, 0.3)]
+        )
         world = (corners @ view.T)[:, :3]
         first, second = (shot.at(f).project(world).pixels[0] for f in (frame, other))
         worst = max(worst, float((second - first).norm(dim=1).max()))
@@ -130,7 +132,7 @@ def lens_pixels(content: Content) -> float:
 
 def _needed(pixels: float, area: bool) -> int:
     """Samples so that neighbours are within a gap: along a line, or over a disc."""
-    gaps = pixels / _GAP
+    gaps = pixels / (_LENS_GAP if area else _GAP)
     return int(min(MOST_SAMPLES, max(2, math.ceil(math.pi / 4 * gaps * gaps if area else gaps))))
 
 
