@@ -69,3 +69,19 @@ class ImageError(ValueError):
 
 class BodyFileError(ValueError):
     """A file of a licensed body (SMPL, SMPL+H, SMPL-X) or its texture coordinates cannot be used."""
+
+
+class BvhError(ValueError):
+    """A `.bvh` file cannot be read as a motion."""
+
+
+class SpzError(ValueError):
+    """A `.spz` file cannot be read as Gaussians."""
+
+
+class GlbError(ValueError):
+    """A `.glb` file cannot be read as Gaussians."""
+
+
+class CameraFileError(ValueError):
+    """A camera file of COLMAP or nerfstudio cannot be read."""

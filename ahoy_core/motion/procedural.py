@@ -7,7 +7,6 @@ any avatar.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Literal
 
 import torch
@@ -15,7 +14,7 @@ from torch import Tensor
 
 from ahoy_core.body.canonical import canonical_pose
 from ahoy_core.body.model import BodyModel
-from ahoy_core.body.rotations import axis_angle_to_matrix, matrix_to_axis_angle
+from ahoy_core.motion.motion import Motion, joined
 
 Side = Literal["left", "right"]
 
@@ -33,27 +32,8 @@ _FULL_RAISE = 1.5
 _NAMES = {"upper_arm": ("upperarm01.{letter}", "{side}_shoulder"), "forearm": ("lowerarm01.{letter}", "{side}_elbow")}
 
 
-@dataclass(frozen=True)
-class Motion:
-    """A motion of T frames.
-
-    Attributes:
-        name: What it shows.
-        pose: [T,J,3] axis-angle, radians, joint 0 in the world.
-        transl: [T,3] metres, world.
-        fps: Frames per second.
-    """
-
-    name: str
-    pose: Tensor
-    transl: Tensor
-    fps: float
-
-    def __len__(self) -> int:
-        return len(self.pose)
-
-
-def _joint(body: BodyModel, part: str, side: Side) -> int:
+def joint_named(body: BodyModel, part: str, side: Side) -> int:
+    """Number of the joint "upper_arm" or "forearm" of a side, under whichever name the body has for it."""
     names = [pattern.format(side=side, letter=side[0].upper()) for pattern in _NAMES[part]]
     for name in names:
         if name in body.joint_names:
@@ -61,16 +41,11 @@ def _joint(body: BodyModel, part: str, side: Side) -> int:
     raise ValueError(f"expected a joint named one of {names} in body {body.name!r}, got none; add its name to _NAMES")
 
 
-def _times(frames: int, fps: float) -> Tensor:
+def frame_times(frames: int, fps: float) -> Tensor:
+    """Shares [T] in [0,1] of a clip that have passed at each frame; refuses an empty clip or rate."""
     if frames < 1 or not fps > 0:
         raise ValueError(f"expected at least one frame and a positive rate, got {frames} frames at {fps} per second")
     return torch.arange(frames, dtype=torch.float32) / max(1, frames - 1)
-
-
-def _rotated(pose: Tensor, joint: int, omega: Tensor) -> Tensor:
-    """Poses [T,J,3] with one joint turned further by omega [T,3], in the axes of rest space."""
-    turned = axis_angle_to_matrix(omega) @ axis_angle_to_matrix(pose[:, joint])
-    return torch.cat([pose[:, :joint], matrix_to_axis_angle(turned)[:, None], pose[:, joint + 1 :]], 1)
 
 
 def turn(body: BodyModel, frames: int, fps: float, pose: Tensor | None = None) -> Motion:
@@ -85,11 +60,11 @@ def turn(body: BodyModel, frames: int, fps: float, pose: Tensor | None = None) -
     Raises:
         ValueError: If frames or fps is not positive.
     """
-    _times(frames, fps)
+    frame_times(frames, fps)
     held = canonical_pose(body) if pose is None else pose
     angles = 2 * math.pi * torch.arange(frames, dtype=torch.float32) / frames
     omega = torch.stack([torch.zeros(frames), torch.zeros(frames), angles], 1)
-    return Motion("turn", _rotated(held.float().expand(frames, -1, -1), 0, omega), torch.zeros(frames, 3), fps)
+    return Motion("turn", joined(held.float().expand(frames, -1, -1), omega, 0), torch.zeros(frames, 3), fps)
 
 
 def wave(body: BodyModel, frames: int, fps: float, side: Side = "right", turning: float = 0.0) -> Motion:
@@ -105,17 +80,17 @@ def wave(body: BodyModel, frames: int, fps: float, side: Side = "right", turning
     Raises:
         ValueError: If frames or fps is not positive, or the body has no such arm.
     """
-    t = _times(frames, fps)
-    up = _smooth(t / _RAMP) * _smooth((1 - t) / _RAMP) * min(1.0, frames / fps / _FULL_RAISE)
+    t = frame_times(frames, fps)
+    up = smooth(t / _RAMP) * smooth((1 - t) / _RAMP) * min(1.0, frames / fps / _FULL_RAISE)
     inside = ((t - _RAMP) / (1 - 2 * _RAMP)).clamp(0, 1)
-    sway = torch.sin(2 * math.pi * _waves(frames, fps) * inside) * _smooth(inside * 4) * _smooth((1 - inside) * 4)
+    sway = torch.sin(2 * math.pi * _waves(frames, fps) * inside) * smooth(inside * 4) * smooth((1 - inside) * 4)
     sign = -1.0 if side == "left" else 1.0  # about y, from the hanging arm outwards and up
     pose = canonical_pose(body).float().expand(frames, -1, -1)
     axis = torch.tensor([0.0, sign, 0.0])
-    pose = _rotated(pose, _joint(body, "upper_arm", side), (_RAISE * up)[:, None] * axis)
-    pose = _rotated(pose, _joint(body, "forearm", side), (_BEND * up + _SWING * sway)[:, None] * axis)
-    around = turning * _smooth(t)
-    pose = _rotated(pose, 0, torch.stack([torch.zeros(frames), torch.zeros(frames), around], 1))
+    pose = joined(pose, (_RAISE * up)[:, None] * axis, joint_named(body, "upper_arm", side))
+    pose = joined(pose, (_BEND * up + _SWING * sway)[:, None] * axis, joint_named(body, "forearm", side))
+    around = turning * smooth(t)
+    pose = joined(pose, torch.stack([torch.zeros(frames), torch.zeros(frames), around], 1), 0)
     return Motion("wave and turn" if turning else "wave", pose, torch.zeros(frames, 3), fps)
 
 
@@ -125,7 +100,7 @@ def _waves(frames: int, fps: float) -> int:
     return max(0, min(_WAVES, int(0.5 * MAX_JOINT_SPEED * seconds / (2 * math.pi * _SWING))))
 
 
-def _smooth(t: Tensor) -> Tensor:
+def smooth(t: Tensor) -> Tensor:
     """0 before 0, 1 after 1, and a smooth step between (zero speed at both ends)."""
     t = t.clamp(0, 1)
     return t * t * (3 - 2 * t)

@@ -1,0 +1,189 @@
+"""What rendering costs: rates of this machine for estimates, and a ledger of what each effect really took.
+
+The rasterizer's time is close to linear in four counts: Gaussians, those that are visible, tile intersections and
+pixels. The coefficients were fitted by `python -m benchmarks.render --fit`; a machine differs by one factor, which
+`calibrate` measures in under a second.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ahoy_core.conventions import Cameras, look_at, perspective_K
+from ahoy_core.splat import rasterization
+from ahoy_core.splat.constants import ALPHA_CUTOFF
+
+_TILE = 16
+_NEAR = 0.05
+
+
+class RasterLoad(NamedTuple):
+    """Counts that decide what one rasterization costs."""
+
+    gaussians: float
+    visible: float
+    intersections: float
+    pixels: float
+
+    def plus(self, other: RasterLoad) -> RasterLoad:
+        """The load of both sets in one picture."""
+        return RasterLoad(
+            self.gaussians + other.gaussians,
+            self.visible + other.visible,
+            self.intersections + other.intersections,
+            max(self.pixels, other.pixels),
+        )
+
+
+@dataclass(frozen=True)
+class Rates:
+    """CPU-seconds of one unit of work.
+
+    Attributes:
+        gaussian, visible, intersection, pixel: Of the rasterizer, per unit of `RasterLoad`.
+        skin: Per avatar and frame: its body posed.
+        joints: Per avatar and frame: its joints' transforms alone.
+        pose: Per Gaussian of an avatar that is posed.
+        carry: Per surface point whose normal is carried along.
+        pair: Per pair of occluder and receiver of a contact shadow.
+        shade: Per Gaussian whose colour is changed.
+        blend: Per pixel that is summed into a picture of several samples.
+        write: Per pixel of a picture that is stored.
+        face: Per frame with an expression.
+    """
+
+    gaussian: float = 4.5e-8
+    visible: float = 1.2e-7
+    intersection: float = 1.17e-7
+    pixel: float = 6.6e-8
+    skin: float = 0.028
+    joints: float = 0.004
+    pose: float = 1.0e-6
+    carry: float = 4.0e-7
+    pair: float = 2.8e-8
+    shade: float = 3.6e-7
+    blend: float = 5.0e-8
+    write: float = 6.5e-8
+    face: float = 0.035
+
+    def scaled(self, factor: float) -> Rates:
+        """The same on a machine that takes `factor` times as long."""
+        return Rates(*(value * factor for value in vars(self).values()))
+
+    def raster(self, load: RasterLoad) -> float:
+        """Seconds of one rasterization."""
+        return (
+            load.gaussians * self.gaussian
+            + load.visible * self.visible
+            + load.intersections * self.intersection
+            + load.pixels * self.pixel
+        )
+
+
+def raster_load(means: Tensor, covars: Tensor, opacities: Tensor, cameras: Cameras) -> RasterLoad:
+    """The load of rendering N Gaussians through the first of `cameras`, from bounding circles.
+
+    Args:
+        means: [N,3] world.
+        covars: [N,3,3].
+        opacities: [N].
+        cameras: The first one counts.
+    """
+    width, height = cameras.width, cameras.height
+    u, v, radius, depth = footprints(means, covars, opacities, cameras)
+    seen = (depth > _NEAR) & (u + radius > 0) & (u - radius < width) & (v + radius > 0) & (v - radius < height)
+    across, down = (_tiles(c[seen], radius[seen], side) for c, side in ((u, width), (v, height)))
+    return RasterLoad(float(len(means)), float(seen.sum()), float((across * down).sum()), float(width * height))
+
+
+def _tiles(center: Tensor, radius: Tensor, side: int) -> Tensor:
+    first, last = ((center + sign * radius).clamp(0, side - 1).div(_TILE).floor() for sign in (-1, 1))
+    return last - first + 1
+
+
+def footprints(
+    means: Tensor, covars: Tensor, opacities: Tensor, cameras: Cameras
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Where Gaussians are in the picture of the first camera: u, v, radius [N] in pixels and depth [N] in metres."""
+    viewmat, K = cameras.viewmats[0].to(means), cameras.Ks[0].to(means)
+    camera = means @ viewmat[:3, :3].T + viewmat[:3, 3]
+    depth = camera[:, 2]
+    near = depth.clamp(min=_NEAR)
+    u, v = (K[i, i] * camera[:, i] / near + K[i, 2] for i in (0, 1))
+    sigmas = (2 * torch.log((opacities / ALPHA_CUTOFF).clamp(min=1))).sqrt()
+    extent = (covars.diagonal(dim1=1, dim2=2).sum(1).clamp(min=0) / 2).sqrt() * K[0, 0] / near
+    return u, v, sigmas * (extent + 0.5), depth
+
+
+def calibrate(seconds: float = 0.4) -> Rates:
+    """Rates of this machine: the standard ones times how long a small rasterization takes here, over what it should.
+
+    Args:
+        seconds: CPU time to spend, about; the fastest run counts, as other work only ever slows one down.
+    """
+    generator = torch.Generator().manual_seed(0)
+    count, size = 8000, 256
+    means = torch.randn(count, 3, generator=generator) * torch.tensor([0.5, 0.5, 0.9])
+    covars = (0.02**2 * torch.eye(3)).expand(count, 3, 3).contiguous()
+    opacities, colors = torch.full((count,), 0.8), torch.rand(count, 3, generator=generator)
+    view = look_at(torch.tensor([0.0, -4.0, 0.0]), torch.zeros(3))
+    cameras = Cameras(view[None], perspective_K(0.7, size, size)[None], size, size)
+    expected = Rates().raster(raster_load(means, covars, opacities, cameras))
+    rasterize(means, covars, opacities, colors, cameras)
+    best, spent = float("inf"), 0.0
+    while spent < seconds:
+        start = time.thread_time()
+        rasterize(means, covars, opacities, colors, cameras)
+        took = time.thread_time() - start
+        best, spent = min(best, took), spent + max(took, 1e-3)
+    return Rates().scaled(best / expected)
+
+
+def rasterize(
+    means: Tensor, covars: Tensor, opacities: Tensor, colors: Tensor, cameras: Cameras
+) -> tuple[Tensor, Tensor, Tensor]:
+    """One rasterization on one thread: premultiplied colours [C,H,W,D], alphas [C,H,W,1], radii [C,N,2]."""
+    image, alpha, meta = rasterization(
+        means,
+        None,
+        None,
+        opacities,
+        colors,
+        cameras.viewmats,
+        cameras.Ks,
+        cameras.width,
+        cameras.height,
+        camera_model=cameras.camera_model,
+        covars=covars,
+        num_threads=1,
+    )
+    return image, alpha, meta["radii"]
+
+
+@dataclass
+class Ledger:
+    """Calls, CPU-seconds and bytes of results of each part of the work, summed over threads."""
+
+    calls: dict[str, int] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict)
+    _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
+
+    @contextmanager
+    def section(self, name: str) -> Iterator[None]:
+        """Time a piece of work of this thread; what never enters here has no entry."""
+        start = time.thread_time()
+        try:
+            yield
+        finally:
+            took = time.thread_time() - start
+            with self._lock:
+                self.calls[name] = self.calls.get(name, 0) + 1
+                self.seconds[name] = self.seconds.get(name, 0.0) + took

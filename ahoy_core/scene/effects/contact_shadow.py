@@ -1,0 +1,164 @@
+"""Contact shadow: what an avatar takes of the sky's light from the surfaces round its feet.
+
+Every scene Gaussian nearby loses the share of its hemisphere, weighted by the cosine, that the avatar covers. The
+avatar is a few hundred discs carried by its joints; a disc facing a point covers A cos cos / (pi d² + A) of it
+(Bunnell, Dynamic Ambient Occlusion and Indirect Lighting, GPU Gems 2), and only those facing it count: of a closed body
+that is its outline, once. Reference: ray casting, tests/scene/test_contact_shadow.py.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ahoy_core.conventions import Cameras
+from ahoy_core.scene.color import to_linear, to_srgb
+from ahoy_core.scene.cost import Rates
+from ahoy_core.scene.effects.effect import Effect, Verdict
+from ahoy_core.scene.puppet import Points, Puppet
+from ahoy_core.scene.shot import Content
+from ahoy_core.splat.gaussians import Gaussians, quats_to_rotations
+
+_STRATA = ((0.06, 110), (0.2, 70), (0.6, 70), (3.0, 70))
+"""Heights in the canonical pose, metres, and how many discs stand for the body up to each."""
+OCCLUDERS = sum(count for _, count in _STRATA)
+REACH = 0.9
+"""Metres from an avatar's nearest part beyond which its shadow is under 2% and left out."""
+_MOST_LIFT = 0.3  # metres: a body higher than this over the ground has no contact to show
+_LEAST_PIXELS = 6  # height in pixels of the shadow's reach on the ground, under which nobody sees it
+
+
+@dataclass(frozen=True)
+class Receivers:
+    """R scene Gaussians that may be shaded: positions [R,3] and normals [R,3] towards the camera."""
+
+    means: Tensor
+    normals: Tensor
+
+
+def occluders(puppet: Puppet) -> Points:
+    """An avatar as discs with all of its area, smaller ones near the ground, where a shadow shows each of them."""
+    points = puppet.points
+    height = points.means[:, 2] - points.means[:, 2].min()
+    chosen, areas, low = [], [], -1.0
+    for high, count in _STRATA:
+        rows = torch.nonzero((height > low) & (height <= high))[:, 0]
+        low = high
+        if len(rows):
+            some = rows[torch.linspace(0, len(rows) - 1, min(count, len(rows))).round().long()]
+            chosen.append(some)
+            areas.append(points.areas[some] * (points.areas[rows].sum() / points.areas[some].sum().clamp(min=1e-12)))
+    picked = points[torch.cat(chosen)]
+    return Points(picked.means, picked.normals, torch.cat(areas), picked.lbs_weights)
+
+
+def receivers(gaussians: Gaussians, rows: Tensor, eye: Tensor) -> Receivers:
+    """Those of the scene's Gaussians `rows` that can receive a shadow, seen from `eye` [3]."""
+    scales = gaussians.scales[rows]
+    axes = quats_to_rotations(gaussians.quats[rows])
+    normals = axes.gather(2, scales.argmin(1)[:, None, None].expand(-1, 3, 1))[:, :, 0]
+    means = gaussians.means[rows]
+    facing = ((eye - means) * normals).sum(1, keepdim=True)
+    return Receivers(means, torch.where(facing < 0, -normals, normals))
+
+
+def sky_share(points: Tensor, normals: Tensor, places: Tensor, facing: Tensor, areas: Tensor) -> Tensor:
+    """The share [R] of each point's light that discs let through.
+
+    Args:
+        points: [R,3] receivers.
+        normals: [R,3] theirs.
+        places: [D,3] discs.
+        facing: [D,3] their normals.
+        areas: [D] m².
+    """
+    # Squares and products by matrix multiplication: [R,D] arrays are all the memory this takes.
+    square = torch.cdist(points, places).square_().clamp_(min=1e-8)
+    inverse = square.rsqrt()
+    at_point = (normals @ places.T - (normals * points).sum(1, keepdim=True)).mul_(inverse).clamp_(min=0)
+    at_disc = ((facing * places).sum(1) - points @ facing.T).neg_().mul_(inverse).clamp_(min=0)
+    covered = at_point.mul_(at_disc).mul_(areas).div_(square.mul_(torch.pi).add_(areas))
+    return (1 - covered.sum(1)).clamp(min=0)
+
+
+def shade(colors: Tensor, to: Receivers, discs: list[Points], relative: list[Tensor], strength: float = 1.0) -> Tensor:
+    """Colours of the scene with the avatars' shadows.
+
+    Args:
+        colors: [R,3] sRGB of the receivers.
+        to: The receivers.
+        discs: One set an avatar.
+        relative: [J,4,4] an avatar: its joints' transforms in this frame.
+        strength: 1 for the share of light that is taken; less for a lighter shadow.
+
+    Returns:
+        [R,3]; the input itself where no receiver is within reach.
+    """
+    posed = [points.posed(one) for points, one in zip(discs, relative, strict=True)]
+    places, facing = torch.cat([p for p, _ in posed]), torch.cat([n for _, n in posed])
+    areas = torch.cat([points.areas for points in discs])
+    low, high = places.amin(0) - REACH, places.amax(0) + REACH
+    near = ((to.means > low) & (to.means < high)).all(1)
+    if not bool(near.any()):
+        return colors
+    share = sky_share(to.means[near], to.normals[near], places, facing, areas)
+    factor = 1 - strength * (1 - share)
+    shaded = colors.clone()
+    shaded[near] = to_srgb(to_linear(colors[near]) * factor[:, None])
+    return shaded
+
+
+def _judge(content: Content) -> Verdict:
+    if content.scene.ground is None or not content.puppets:
+        return Verdict(False, "no ground was found" if content.puppets else "there is no avatar")
+    pixels, lift, count = 0.0, float("inf"), 0
+    for surfaces in content.surfaces:
+        for (places, _), frame in zip(surfaces, content.moments, strict=True):
+            lift = min(lift, float(places[:, 2].min()))
+            seen, below = _ground_in_view(content, places, content.shot.at(frame))
+            pixels, count = max(pixels, seen), max(count, below)
+    evidence = {"height_m": round(lift, 3), "pixels": round(pixels, 1), "receivers": float(count)}
+    if lift > _MOST_LIFT:
+        return Verdict(False, f"the avatar is never less than {lift:.2f} m over the ground", evidence)
+    if pixels < _LEAST_PIXELS or not count:
+        return Verdict(False, "no ground near the avatar is in the picture", evidence)
+    return Verdict(
+        True, f"feet come within {max(0.0, lift):.2f} m of ground that is in the picture", evidence, OCCLUDERS
+    )
+
+
+def _ground_in_view(content: Content, places: Tensor, cameras: Cameras) -> tuple[float, int]:
+    """Height in pixels of the ground round the lowest part, as far as it is in the picture, and Gaussians there."""
+    foot = places[places[:, 2].argmin()]
+    steps = torch.linspace(-0.5, 0.5, 9)
+    grid = torch.stack([p.reshape(-1) for p in (*torch.meshgrid(steps, steps, indexing="ij"), torch.zeros(9, 9))], 1)
+    pixels, depths = cameras.project(grid + foot * torch.tensor([1.0, 1.0, 0.0]))
+    u, v = pixels[0].unbind(1)
+    shown = (depths[0] > 0.05) & (u >= 0) & (u < cameras.width) & (v >= 0) & (v < cameras.height)
+    if not bool(shown.any()):
+        return 0.0, 0
+    offset = content.scene.gaussians.means - foot * torch.tensor([1.0, 1.0, 0.0])
+    below = (offset[:, :2].abs() < 0.5).all(1) & (offset[:, 2].abs() < 0.1)
+    return float(v[shown].max() - v[shown].min()), int(below.sum())
+
+
+def _seconds(content: Content, verdict: Verdict, rates: Rates) -> float:
+    near = 0
+    for surfaces in content.surfaces:
+        places = surfaces[len(surfaces) // 2][0]
+        inside = (content.scene.gaussians.means > places.amin(0) - REACH).all(1)
+        near += int((inside & (content.scene.gaussians.means < places.amax(0) + REACH).all(1)).sum())
+    discs = OCCLUDERS * len(content.puppets)
+    frame = near * (discs * rates.pair + rates.shade) + len(content.scene) * rates.gaussian
+    return content.frames * (frame + len(content.puppets) * rates.joints)
+
+
+CONTACT_SHADOW = Effect(
+    "contact_shadow",
+    "avatars darken the ground they stand on",
+    _judge,
+    _seconds,
+    lambda content: bool(content.puppets) and len(content.scene) > 0,
+)

@@ -1,0 +1,98 @@
+"""An avatar in a scene: who moves how, and quick access to where parts of it are.
+
+`Avatar.pose` makes the Gaussians of a frame. Planning needs less, for many frames at once: the joints' transforms
+alone, and a few surface points carried by them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from ahoy_core.avatar.avatar import Avatar
+from ahoy_core.body.canonical import canonical_pose
+from ahoy_core.body.convert import body_skeleton
+from ahoy_core.body.lbs import blend_transforms, forward_kinematics
+from ahoy_core.body.model import BodyModel
+from ahoy_core.body.rotations import axis_angle_to_matrix
+from ahoy_core.motion.motion import Motion
+
+# Surface points that stand for an avatar where all of them would cost more than they tell.
+SAMPLE = 1500
+
+
+@dataclass(frozen=True)
+class Points:
+    """M surface points of an avatar in the canonical pose: means, outward normals, areas [M] m², skinning [M,J]."""
+
+    means: Tensor
+    normals: Tensor
+    areas: Tensor
+    lbs_weights: Tensor
+
+    def __getitem__(self, rows: Tensor) -> Points:
+        return Points(self.means[rows], self.normals[rows], self.areas[rows], self.lbs_weights[rows])
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    def posed(self, relative: Tensor) -> tuple[Tensor, Tensor]:
+        """Positions and unit normals [M,3] under the joints' transforms [J,4,4]."""
+        blend = blend_transforms(self.lbs_weights, relative[None])[0]
+        places = (blend[:, :3, :3] @ self.means[:, :, None])[:, :, 0] + blend[:, :3, 3]
+        normals = (blend[:, :3, :3] @ self.normals[:, :, None])[:, :, 0]
+        return places, torch.nn.functional.normalize(normals, dim=1)
+
+
+@dataclass(frozen=True)
+class Puppet:
+    """One avatar, its body and its motion, placed in the world.
+
+    Attributes:
+        avatar: Who.
+        body: The body model that poses it.
+        motion: T frames, in the world.
+    """
+
+    avatar: Avatar
+    body: BodyModel
+    motion: Motion
+
+    @cached_property
+    def rest(self) -> Tensor:
+        """[J,3] joints at rest, of this avatar's shape."""
+        return body_skeleton(self.body, self.avatar.betas).rest_joints.float()
+
+    @cached_property
+    def _from_canonical(self) -> Tensor:
+        """[J,4,4] inverse of the canonical pose's transforms."""
+        rotations = axis_angle_to_matrix(canonical_pose(self.body).float())[None]
+        start = forward_kinematics(rotations, self.rest[None], self.body.parents, torch.zeros(1, 3))[0]
+        return torch.linalg.inv(start)
+
+    def relative(self, pose: Tensor, transl: Tensor) -> Tensor:
+        """[T,J,4,4]: what takes the canonical body to each of T poses [T,J,3] with translations [T,3]."""
+        rotations = axis_angle_to_matrix(pose)
+        return forward_kinematics(rotations, self.rest[None], self.body.parents, transl) @ self._from_canonical
+
+    @cached_property
+    def points(self) -> Points:
+        """All Gaussians as surface points."""
+        template = self.avatar.template
+        return Points(self.avatar.means, template.rotations[:, :, 2], template.areas, self.avatar.lbs_weights)
+
+    @cached_property
+    def sample(self) -> Points:
+        """An even choice of at most `SAMPLE` of them, which stand for the areas of all."""
+        step = max(1, -(-len(self.points) // SAMPLE))
+        chosen = self.points[torch.arange(0, len(self.points), step)]
+        share = float(self.points.areas.sum() / chosen.areas.sum().clamp(min=1e-12))
+        return Points(chosen.means, chosen.normals, chosen.areas * share, chosen.lbs_weights)
+
+    def surface(self, frames: list[int]) -> list[tuple[Tensor, Tensor]]:
+        """Positions and normals of the sample at each of these frames."""
+        relative = self.relative(self.motion.pose[frames], self.motion.transl[frames])
+        return [self.sample.posed(one) for one in relative]
