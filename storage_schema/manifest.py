@@ -99,11 +99,24 @@ class Manifest:
             raise CorruptError(
                 f"manifest has fields {sorted(body)}, expected {sorted(field.name for field in fields(cls))}"
             )
-        blobs = tuple(BlobRef(**blob) for blob in body.pop("blobs"))
+        blobs = tuple(_checked_blob(blob) for blob in body.pop("blobs"))
         manifest = cls(blobs=blobs, **body)
         if manifest.content_hash != content_hash(blobs):
             raise CorruptError("manifest's content hash does not fit its blobs")
         return manifest
+
+
+def _checked_blob(fields_of_blob: Mapping[str, Any]) -> BlobRef:
+    """A blob as a manifest states it; a store may be somebody else's, so its names must not lead out of any folder."""
+    try:
+        blob = BlobRef(**fields_of_blob)
+        check_blob_name(blob.name)
+        steps = blob.path.split("/")
+    except (TypeError, AttributeError, ArtifactError) as error:
+        raise CorruptError(f"manifest has a blob that cannot be used ({error})") from error
+    if not all(steps) or {".", ".."} & set(steps) or "\\" in blob.path or "\0" in blob.path:
+        raise CorruptError(f"manifest has a blob at {blob.path!r}, expected a path below the store's root")
+    return blob
 
 
 def content_hash(blobs: Iterable[BlobRef]) -> str:

@@ -66,7 +66,7 @@ def _checked_body(data: bytes, what: str) -> dict[str, Any]:
         document = json.loads(data)
         body, expected = document[what], document["sha256"]
         whole = hashlib.sha256(canonical_json(body)).hexdigest() == expected
-    except (ValueError, TypeError, KeyError) as error:
+    except (ValueError, TypeError, KeyError, RecursionError) as error:
         raise CorruptError(f"{what} is unreadable ({error})") from error
     if not whole or not isinstance(body, dict) or not isinstance(body.get("schema_version"), int):
         raise CorruptError(f"{what} does not have the checksum it was written with")

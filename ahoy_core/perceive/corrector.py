@@ -103,6 +103,10 @@ def features(points: Tensor, world: Tensor, visibility: Tensor, frame: Frame, up
 class Corrector(nn.Module):
     """Two hidden layers beside a straight one. `forward` takes features and gives offsets and logarithms of spreads."""
 
+    mean: Tensor
+    spread: Tensor
+    calibration: Tensor
+
     def __init__(self, dropout: float = 0.0) -> None:
         super().__init__()
         self.register_buffer("mean", torch.zeros(FEATURES))
@@ -139,7 +143,8 @@ def predict(
     answer = network(features(*mirrored(points, world, visibility), turned, up * flip3))
     order = list(MIRROR)
     back = (answer[0][:, order] * flip2, answer[1][:, order] * flip3, answer[2][:, order])
-    return tuple(0.5 * (a + b) for a, b in zip(straight, back, strict=True))  # type: ignore[return-value]
+    points, world, spreads = (0.5 * (a + b) for a, b in zip(straight, back, strict=True))
+    return points, world, spreads
 
 
 def correct(

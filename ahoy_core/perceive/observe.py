@@ -28,7 +28,8 @@ def observations(
     """Turn the found frames into tensors; camera axes become world axes."""
     found = track.found
     to_world = OBSERVED_VIEWMAT[:3, :3].double()  # rows times this matrix are the inverse rotation
-    points, world = track.landmarks[found, :, :2], track.world[found]
+    points: NDArray[np.floating] = track.landmarks[found, :, :2]
+    world: NDArray[np.floating] = track.world[found]
     # Visible landmarks score above .9 and hidden ones .4 to .8: the fourth power tells them apart.
     visible = torch.from_numpy(track.visibility[found].astype(np.float64)) ** 4
     weights = world_weights = visible

@@ -39,7 +39,7 @@ def test_a_store_of_a_newer_schema_is_refused_with_what_to_do(store: ArtifactSto
         b"\xff\xfe\x00",
         b'{"manifest": {}, "sha256": ""}',
         b'{"manifest": [], "sha256": "x"}',
-        pytest.param(b"[" * 100_000, marks=pytest.mark.xfail(raises=RecursionError, reason="the reader of manifests")),
+        b"[" * 100_000,
         b'{"manifest": {"schema_version": 1e999}, "sha256": ""}',
         b"cos\nsystem\n(S'id'\ntR.",
     ],
@@ -51,7 +51,6 @@ def test_an_unreadable_manifest_is_none_and_the_stage_is_made_again(store: Artif
     assert commit(store) == store.lookup(KEY)
 
 
-@pytest.mark.xfail(reason="the store does not check the names and paths that a manifest gives its blobs")
 @pytest.mark.parametrize("name", ["../../stolen", "{outside}/stolen", "..\\stolen", "a/../../stolen"])
 def test_a_manifest_cannot_make_a_reader_write_outside_its_folder(tmp_path: Path, name: str) -> None:
     remote = open_store(f"memory://{tmp_path.name}", tmp_path / "cache")
@@ -65,3 +64,11 @@ def test_a_manifest_cannot_make_a_reader_write_outside_its_folder(tmp_path: Path
         with contextlib.suppress(ValueError, OSError):
             remote.fetch(found)
     assert not [path for path in tmp_path.rglob("*") if "stolen" in path.name]
+
+
+@pytest.mark.parametrize("path", ["../outside", "/etc/passwd", "artifacts/../../outside", "a//b", ""])
+def test_a_manifest_cannot_make_a_reader_read_outside_the_store(store: ArtifactStore, path: str) -> None:
+    manifest = commit(store)
+    first, *others = manifest.blobs
+    store.backend.write(MANIFEST, replace(manifest, blobs=(replace(first, path=path), *others)).to_json())
+    assert store.lookup(KEY) is None
