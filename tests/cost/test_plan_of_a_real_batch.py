@@ -59,7 +59,7 @@ tables = Tables(store)
 def attempt(video, number):
     rng, started = random.Random(video), time.monotonic()
     seconds = {"fetch": rng.uniform(0.02, 0.1), "fit": rng.uniform(0.05, 0.3)}
-    run = Run(store, tables, "b", video, f"{video}-{number}", Silent(), number)
+    run = Run(store, tables, "b", video, f"{video}-{number}", Silent(), attempt_number=number)
     row = {"video_id": video, "run_id": run.run_id, "attempt_number": number}
     def tell(seq, state):
         wall = time.monotonic() - started
