@@ -37,3 +37,44 @@ def corpus(
     for shard in claimed(folder, [*train[:4], *held, *train[4:]]):
         path = make_shard(folder, shard, seed, body, wardrobe)
         console.print(f"{path.name} ({path.stat().st_size / 2**20:.0f} MB)", highlight=False)
+
+
+@app.command()
+def train(
+    what: Annotated[str, typer.Argument(help="autoencoder, decoder (latents stay as they are) or flow.")],
+    corpus_folder: Annotated[Path, typer.Option("--corpus", help="Folder of shards.")],
+    out: Annotated[Path, typer.Option(help="Folder of the prior; what is there is trained further.")],
+    minutes: Annotated[float, typer.Option(help="Wall time of this run.", min=0.0)] = 30.0,
+    cooldown: Annotated[float, typer.Option(help="Last share of this run with a falling rate.", min=0, max=1)] = 0.0,
+    lr: Annotated[float, typer.Option(help="Learning rate.", min=0.0)] = 2e-3,
+    threads: Annotated[int, typer.Option(help="Threads.", min=1)] = 1,
+) -> None:
+    """Train for some minutes, or go on where the last run stopped."""
+    from ahoy_core.prior.train.loop import Schedule
+    from tasks import prior_training
+
+    torch.set_num_threads(threads)
+    schedule = Schedule(lr=lr, minutes=minutes, cooldown=cooldown, log_steps=20 if what == "flow" else 50)
+
+    def note(row: dict[str, float]) -> None:
+        console.print("  ".join(f"{name} {value:.4g}" for name, value in row.items()), highlight=False, soft_wrap=True)
+
+    if what in ("autoencoder", "decoder"):
+        prior_training.train_autoencoder(corpus_folder, out, schedule, note, decoder_only=what == "decoder")
+    elif what == "flow":
+        prior_training.train_flow(out, schedule, note)
+    else:
+        raise typer.BadParameter(f"expected autoencoder, decoder or flow, got {what!r}")
+
+
+@app.command()
+def encode(
+    corpus_folder: Annotated[Path, typer.Option("--corpus", help="Folder of shards.")],
+    out: Annotated[Path, typer.Option(help="Folder of the prior, with its finished autoencoder.")],
+    threads: Annotated[int, typer.Option(help="Threads.", min=1)] = 1,
+) -> None:
+    """Turn shards into the latents that the flow is trained on; what is there stays."""
+    from tasks import prior_training
+
+    torch.set_num_threads(threads)
+    prior_training.encode_corpus(corpus_folder, out, lambda name: console.print(name, highlight=False))

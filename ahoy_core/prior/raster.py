@@ -24,7 +24,9 @@ class Hits(NamedTuple):
     depth: Array
 
 
-def rasterize(screen: Array, faces: Array, height: int, width: int, alpha: tuple[Array, Array, Array] | None = None) -> Hits:
+def rasterize(
+    screen: Array, faces: Array, height: int, width: int, alpha: tuple[Array, Array, Array] | None = None
+) -> Hits:
     """The nearest triangle of each pixel.
 
     Barycentric weights are linear in the image: at the distances of person images (2.5 m and more) the perspective error

@@ -39,7 +39,9 @@ class BaseMesh:
             columns.append(body.joint_names.index(name) if known else columns[parents[bone]])
         indices = np.asarray(columns)[self._model.vertex_bone_indices.numpy()]
         self.lbs_weights: Array = np.zeros((len(indices), body.n_joints))
-        np.add.at(self.lbs_weights, (np.arange(len(indices))[:, None], indices), self._model.vertex_bone_weights.numpy())
+        np.add.at(
+            self.lbs_weights, (np.arange(len(indices))[:, None], indices), self._model.vertex_bone_weights.numpy()
+        )
         self.lbs_weights /= np.maximum(self.lbs_weights.sum(1, keepdims=True), 1e-9)
 
     def vertices(self, betas: Tensor) -> Array:

@@ -176,7 +176,9 @@ def _lights(rng: np.random.Generator, scene: Scene) -> list[Light]:
     """One light a frame: fixed to the camera (the person turns) or to the world (the camera goes round)."""
     ambient, sky = float(rng.uniform(0.5, 0.9)), float(rng.uniform(0, 0.15))
     azimuth, elevation = rng.uniform(-1.2, 1.2), rng.uniform(0.1, 1.1)
-    flat = np.array([math.sin(azimuth) * math.cos(elevation), -math.sin(elevation), -math.cos(azimuth) * math.cos(elevation)])
+    flat = np.array(
+        [math.sin(azimuth) * math.cos(elevation), -math.sin(elevation), -math.cos(azimuth) * math.cos(elevation)]
+    )
     if rng.random() < 0.6:
         return [Light(ambient, flat, sky)] * FRAMES
     turns = scene.cameras.viewmats[:, :3, :3].numpy()

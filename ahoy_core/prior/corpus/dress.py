@@ -162,7 +162,9 @@ def _shell_pieces(chart: BodyChart, shell: Shell, vertices: Array, normals: Arra
 def _is_lower(faces: Array, vertices: Array, hip: float) -> Array:
     """[F] bool: which of a suit's connected pieces are trousers; a suit of one piece is cut at the hip."""
     n = len(vertices)
-    links = coo_matrix((np.ones(2 * len(faces)), (np.r_[faces[:, 0], faces[:, 1]], np.r_[faces[:, 1], faces[:, 2]])), (n, n))
+    links = coo_matrix(
+        (np.ones(2 * len(faces)), (np.r_[faces[:, 0], faces[:, 1]], np.r_[faces[:, 1], faces[:, 2]])), (n, n)
+    )
     count, label = connected_components(links, directed=False)
     middle = np.array([np.median(vertices[label == c, 2]) for c in range(count)])
     below = (middle < hip + 0.02)[label]
@@ -186,7 +188,9 @@ def _assembled(
         outfit=outfit,
         vertices=np.concatenate([piece.vertices for piece in pieces]).astype(np.float32),
         lbs_weights=np.concatenate([piece.lbs_weights for piece in pieces]).astype(np.float32),
-        faces=np.concatenate([piece.faces + start for piece, start in zip(pieces, starts, strict=True)]).astype(np.int32),
+        faces=np.concatenate([piece.faces + start for piece, start in zip(pieces, starts, strict=True)]).astype(
+            np.int32
+        ),
         uvs=np.concatenate([piece.uvs for piece in pieces]).astype(np.float32),
         materials=np.concatenate([piece.materials for piece in pieces]),
         textures=textures,

@@ -63,7 +63,9 @@ def read_garment(folder: Path) -> Garment:
     textures = _read_mhmat(folder / fields["material"]) if "material" in fields else {}
     rows = np.array(fields["verts"], dtype=np.float64)
     if len(rows) == 0 or faces.max() >= len(rows):
-        raise AssetError(f"expected a line under 'verts' for each vertex of {fields['obj_file']}, got {len(rows)} lines")
+        raise AssetError(
+            f"expected a line under 'verts' for each vertex of {fields['obj_file']}, got {len(rows)} lines"
+        )
     return Garment(
         name=folder.name,
         corners=rows[:, :3].astype(np.int64),

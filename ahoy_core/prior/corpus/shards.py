@@ -90,7 +90,9 @@ def read_shard(path: Path, names: tuple[str, ...]) -> tuple[dict[str, Array], di
     with safe_open(path, "numpy") as handle:
         meta = json.loads(handle.metadata()["ahoy"])
         if meta["version"] != VERSION:
-            raise ValueError(f"expected a shard of version {VERSION}, got {meta['version']} in {path.name}; make it again")
+            raise ValueError(
+                f"expected a shard of version {VERSION}, got {meta['version']} in {path.name}; make it again"
+            )
         return {name: handle.get_tensor(name) for name in names}, meta
 
 
