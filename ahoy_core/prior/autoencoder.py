@@ -1,4 +1,4 @@
-"""Codes frames one by one: 8x down, 16 channels; small enough to train and run on a CPU, in diffusers' on-disk format."""
+"""Codes frames one by one, 8x down, 16 channels: trains and runs on a CPU, in diffusers' on-disk format."""
 
 from __future__ import annotations
 

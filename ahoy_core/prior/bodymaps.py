@@ -14,7 +14,7 @@ from ahoy_core.conventions import Cameras
 from ahoy_core.prior.raster import rasterize
 
 CHANNELS: Final = 7
-"""Silhouette, place on the body (x, y, z of the average adult at rest, each scaled to [-1,1]), normal in camera axes."""
+"""Silhouette; place on the body (x, y, z of the average adult at rest, each in [-1,1]); normal in camera axes."""
 CELL: Final = 4  # pixels of the person image a cell of the maps
 
 

@@ -6,8 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import torch
-from torch import Tensor
-from torch.nn import functional as F
+from torch import Tensor, nn
 
 from ahoy_core.prior.autoencoder import FACTOR
 from ahoy_core.prior.bodymaps import CELL, CHANNELS
@@ -95,7 +94,7 @@ def transformer_input(latents: Tensor, context: Context) -> Tensor:
                 f"expected body maps {[batch, frames, CHANNELS, 2 * height, 2 * width]} for these latents, got "
                 f"{list(context.body.shape)}; render them at the person image's size"
             )
-        folded = F.pixel_unshuffle(context.body.to(latents), FACTOR // CELL).transpose(1, 2)
+        folded = nn.functional.pixel_unshuffle(context.body.to(latents), FACTOR // CELL).transpose(1, 2)
         turn = context.azimuth.to(latents)[:, None, :, None, None].expand(batch, 1, frames, height, width)
         body = torch.cat([folded, turn.sin(), turn.cos(), torch.ones_like(turn)], 1)
     coarse = torch.zeros_like(latents) if context.coarse is None else context.coarse
@@ -117,6 +116,6 @@ def held_tokens(coverage: Tensor, mask: Tensor, threshold: float = 0.97) -> Tens
         [B,T,H/16,W/16] bool.
     """
     size = FACTOR * PATCH
-    seen = F.avg_pool2d(torch.minimum(coverage, mask), size)
-    there = F.avg_pool2d(mask, size)
+    seen = nn.functional.avg_pool2d(torch.minimum(coverage, mask), size)
+    there = nn.functional.avg_pool2d(mask, size)
     return seen >= threshold * there - 1e-6

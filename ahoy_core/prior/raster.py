@@ -17,7 +17,7 @@ _kernel = numba.njit(nogil=True, cache=True, error_model="numpy")
 
 
 class Hits(NamedTuple):
-    """What each pixel of an image sees: face [H,W] int32 (-1 nothing), bary [H,W,2] of corners 1 and 2, depth [H,W]."""
+    """What pixels see: face [H,W] int32 (-1 nothing), bary [H,W,2] of corners 1 and 2, depth [H,W]."""
 
     face: Array
     bary: Array
@@ -29,7 +29,7 @@ def rasterize(
 ) -> Hits:
     """The nearest triangle of each pixel.
 
-    Barycentric weights are linear in the image: at the distances of person images (2.5 m and more) the perspective error
+    Barycentric weights are linear in the image: at person images' distances (2.5 m and more) the perspective error
     inside one triangle of a body is far below a pixel.
 
     Args:

@@ -19,9 +19,11 @@ MAX_TOKENS: Final = 24
 TEXT_WIDTH: Final = 64
 
 _WORDS = (
-    "man woman wearing in with and of the from front back left right side view standing sitting turning walking arms "
-    "raised shirt jacket jeans skirt shorts dress sleeves short long stripes plain print dark light video photo"
-).split()
+    "man", "woman", "wearing", "in", "with", "and", "of", "the", "from", "front", "back", "left", "right",
+    "side", "view", "standing", "sitting", "turning", "walking", "arms", "raised", "shirt", "jacket", "jeans",
+    "skirt", "shorts", "dress", "sleeves", "short", "long", "stripes", "plain", "print", "dark", "light",
+    "video", "photo",
+)  # fmt: skip
 
 
 def build_tokenizer() -> Any:

@@ -131,7 +131,7 @@ def _read_obj(path: Path) -> tuple[Array, Array]:
         if words[0] == "vt":
             texture.append([float(words[1]), float(words[2])])
         elif words[0] == "f":
-            pairs = [(word.split("/") + [""])[:2] for word in words[1:]]
+            pairs = [[*word.split("/"), ""][:2] for word in words[1:]]
             vertex = [int(pair[0]) - 1 for pair in pairs]
             coordinate = [int(pair[1]) - 1 if pair[1] else 0 for pair in pairs]
             for k in range(1, len(vertex) - 1):

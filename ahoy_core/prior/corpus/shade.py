@@ -8,7 +8,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from ahoy_core.prior.corpus import paint as P
+from ahoy_core.prior.corpus import paint
 from ahoy_core.prior.corpus.dress import KINDS, Dressed
 from ahoy_core.prior.raster import Hits, texel
 
@@ -57,12 +57,12 @@ def surface(hits: Hits, person: Dressed, normals: Array) -> Surface:
     return Surface(index, person.materials[face], colour, normal, rest)
 
 
-def shade(surface_: Surface, paint: Array, person: Dressed, light: Light) -> Array:
-    """sRGB colours [N,3] float32 in [0,1] of the covered pixels."""
+def shade(surface_: Surface, rows: Array, person: Dressed, light: Light) -> Array:
+    """Colours [N,3] float32 sRGB in [0,1] of the covered pixels."""
     out = np.empty((len(surface_.index), 3), dtype=np.float32)
     direction = (light.direction / np.linalg.norm(light.direction)).astype(np.float32)
     _shade(
-        surface_.material, surface_.texture, surface_.normal, surface_.rest, paint, person.features,
+        surface_.material, surface_.texture, surface_.normal, surface_.rest, rows, person.features,
         light.ambient, direction, light.sky, out,
     )  # fmt: skip
     return out
@@ -96,21 +96,21 @@ def _lookup(
 @_kernel
 def _patterned(row: Array, x: float, y: float, z: float) -> bool:
     """Whether a point of rest space shows the pattern's second colour."""
-    kind, frequency, phase, duty = int(row[P.PATTERN]), row[P.FREQUENCY], row[P.PHASE], row[P.DUTY]
+    kind, frequency, phase, duty = int(row[paint.PATTERN]), row[paint.FREQUENCY], row[paint.PHASE], row[paint.DUTY]
     across = (z * frequency + phase) % 1.0 < duty
     upright = (x * frequency + phase) % 1.0 < duty
-    if kind == P.STRIPES:
+    if kind == paint.STRIPES:
         return across
-    if kind == P.COLUMNS_PATTERN:
+    if kind == paint.COLUMNS_PATTERN:
         return upright
-    if kind == P.CHECKS:
+    if kind == paint.CHECKS:
         return across != upright
-    if kind == P.DOTS:
+    if kind == paint.DOTS:
         dx, dz = (x * frequency) % 1.0 - 0.5, (z * frequency) % 1.0 - 0.5
         return dx * dx + dz * dz < 0.25 * duty
-    if kind == P.BLOCK:
+    if kind == paint.BLOCK:
         return z < phase
-    if kind == P.PANELS:
+    if kind == paint.PANELS:
         return abs(x) > 0.1 + 0.1 * duty
     return False
 
@@ -119,19 +119,19 @@ def _patterned(row: Array, x: float, y: float, z: float) -> bool:
 def _printed(row: Array, x: float, y: float, z: float) -> bool:
     """Whether a point of rest space lies in a print; row is the print's eight numbers."""
     kind = int(row[0])
-    if kind == P.NO_PRINT or y * row[1] < -0.02:
+    if kind == paint.NO_PRINT or y * row[1] < -0.02:
         return False
     dx, dz = (x - row[2]) / row[4], (z - row[3]) / row[4]
     distance = dx * dx + dz * dz
-    if kind == P.DISC:
+    if kind == paint.DISC:
         return distance < 1.0
-    if kind == P.BOX:
+    if kind == paint.BOX:
         return abs(dx) < 0.8 and abs(dz) < 0.8
-    if kind == P.BAR:
+    if kind == paint.BAR:
         return abs(dx) < 1.0 and abs(dz) < 0.35
-    if kind == P.CROSS:
+    if kind == paint.CROSS:
         return (abs(dx) < 0.3 and abs(dz) < 1.0) or (abs(dz) < 0.3 and abs(dx) < 1.0)
-    if kind == P.RING:
+    if kind == paint.RING:
         return 0.45 < distance < 1.0
     letter = (int(np.floor(dx * 3.0)) * 7 + int(np.floor(dz * 2.0)) * 13 + int(row[4] * 1000)) % 5
     return abs(dx) < 1.0 and abs(dz) < 0.5 and letter < 3
@@ -139,33 +139,33 @@ def _printed(row: Array, x: float, y: float, z: float) -> bool:
 
 @_kernel
 def _shade(
-    material: Array, texture: Array, normal: Array, rest: Array, paint: Array, features: Array, ambient: float,
+    material: Array, texture: Array, normal: Array, rest: Array, rows: Array, features: Array, ambient: float,
     direction: Array, sky: float, out: Array,
 ) -> None:  # fmt: skip
     tint = np.empty(3, dtype=np.float32)
     for n in range(len(material)):
         m = material[n]
-        row = paint[m]
+        row = rows[m]
         x, y, z = rest[n, 0], rest[n, 1], rest[n, 2]
-        second = row[P.PATTERN] > 0 and _patterned(row, x, y, z)
+        second = row[paint.PATTERN] > 0 and _patterned(row, x, y, z)
         blend = 1.0 if second else 0.0
-        if int(row[P.PATTERN]) == P.GRADIENT:
-            blend = min(1.0, max(0.0, 0.5 + (row[P.PHASE] - z) * 2.5))
-        keep = row[P.KEEP] * (1.0 - blend)
-        grey = (texture[n, 0] + texture[n, 1] + texture[n, 2]) / 3.0 / row[P.GREYNESS]
+        if int(row[paint.PATTERN]) == paint.GRADIENT:
+            blend = min(1.0, max(0.0, 0.5 + (row[paint.PHASE] - z) * 2.5))
+        keep = row[paint.KEEP] * (1.0 - blend)
+        grey = (texture[n, 0] + texture[n, 1] + texture[n, 2]) / 3.0 / row[paint.GREYNESS]
         grey = min(grey, 1.6)
         for k in range(3):
-            tint[k] = row[P.TINT + k] + blend * (row[P.PATTERN_TINT + k] - row[P.TINT + k])
-        if m == _SKIN or m == _EYES:
+            tint[k] = row[paint.TINT + k] + blend * (row[paint.PATTERN_TINT + k] - row[paint.TINT + k])
+        if m in (_SKIN, _EYES):
             _face(m, x, y, z, features, tint)
         for number in range(2):
-            start = P.PRINTS + number * P.PRINT_WIDTH
-            if _printed(row[start : start + P.PRINT_WIDTH], x, y, z):
+            start = paint.PRINTS + number * paint.PRINT_WIDTH
+            if _printed(row[start : start + paint.PRINT_WIDTH], x, y, z):
                 keep = 0.0
                 for k in range(3):
                     tint[k] = row[start + 5 + k]
         rough = np.sin(61.0 * x + 17.0 * z) * np.sin(47.0 * z - 23.0 * y) * np.sin(53.0 * y + 29.0 * x + 11.0)
-        wrinkle = 1.0 + row[P.GRAIN] * 2.0 * rough
+        wrinkle = 1.0 + row[paint.GRAIN] * 2.0 * rough
         toward = 0.0
         for k in range(3):
             toward += normal[n, k] * direction[k]

@@ -52,7 +52,7 @@ class BodyChart:
         return self.body.lbs_weights.argmax(1).numpy()
 
     def along(self, limb: str) -> Array:
-        """[V] position along a limb: 0 at its root, 0.5 at the elbow or knee, 1 at its end, above 1 beyond; NaN elsewhere."""
+        """[V] position along a limb: 0 root, 0.5 elbow or knee, 1 wrist or ankle, more beyond; NaN elsewhere."""
         upper, lower, *anchors = _LIMBS[limb]
         vertices, joints = self.rest
         names = list(self.body.joint_names)

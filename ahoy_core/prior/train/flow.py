@@ -130,7 +130,7 @@ def random_tau(generator: torch.Generator, size: int) -> Tensor:
 
 
 class FixedValidation:
-    """The flow's loss on fixed clips, noise and times of a held-out split: observed frames held, body known, no coarse."""
+    """The loss on fixed clips, noise and times of a held-out split: observed frames held, body known, no coarse."""
 
     def __init__(self, pool: LatentPool, size: int = 24) -> None:
         clips = next(iter(pool._clips.values()))

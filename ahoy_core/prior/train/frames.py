@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
-from torch.nn import functional as F
+from torch import Tensor, nn
 
 from ahoy_core.conventions import GREY
 from ahoy_core.prior.autoencoder import FACTOR, FrameAutoencoder
@@ -95,12 +94,14 @@ def autoencoder_loss(
     latents = model.encode(frames)
     noisy = latents + _NOISE * torch.randn(latents.shape, generator=generator)
     error = model.decode(noisy) - frames
-    weight = 0.25 + F.max_pool2d(masks, 5, 1, 2)
+    weight = 0.25 + nn.functional.max_pool2d(masks, 5, 1, 2)
     value = 3 * (error.square() * weight).mean() + 0.5 * (error.abs() * weight).mean()
     value = value + 0.5 * (error.diff(dim=-1).abs() * weight[..., 1:]).mean()
     value = value + 0.5 * (error.diff(dim=-2).abs() * weight[..., 1:, :]).mean()
     mean, std = latents.mean((0, 2, 3)), latents.std((0, 2, 3))
-    value = value + 1e-3 * (mean.square() + (std - 1).square()).mean() + 1e-3 * F.relu(latents.abs() - 4).mean()
+    value = (
+        value + 1e-3 * (mean.square() + (std - 1).square()).mean() + 1e-3 * nn.functional.relu(latents.abs() - 4).mean()
+    )
     return value, {"psnr_mask": masked_psnr(error.detach(), masks)}
 
 
@@ -113,8 +114,8 @@ def start_from_principal_components(model: FrameAutoencoder, frames: Tensor, mas
         frames: [N,3,H,W] in [-1,1]; some hundred crops.
         masks: [N,1,H,W] alpha.
     """
-    patches = F.pixel_unshuffle(frames, FACTOR).permute(0, 2, 3, 1)
-    patches = patches[F.avg_pool2d(masks, FACTOR)[:, 0] > 0.05]
+    patches = nn.functional.pixel_unshuffle(frames, FACTOR).permute(0, 2, 3, 1)
+    patches = patches[nn.functional.avg_pool2d(masks, FACTOR)[:, 0] > 0.05]
     mean = patches.mean(0)
     deviations, basis = torch.linalg.svd(patches - mean, full_matrices=False)[1:]
     count = model.config.latent_channels
@@ -152,7 +153,7 @@ def latent_statistics(model: FrameAutoencoder, folder: Path, shards_used: int = 
     for path in shards(folder, "train")[:shards_used]:
         arrays, _ = read_shard(path, ("image", "mask"))
         for clip, mask in zip(arrays["image"][::16], arrays["mask"][::16], strict=True):
-            share = F.avg_pool2d(torch.from_numpy(mask)[:, None].float() / 255, FACTOR)[:, 0]
+            share = nn.functional.avg_pool2d(torch.from_numpy(mask)[:, None].float() / 255, FACTOR)[:, 0]
             latents.append(model.encode(to_model(clip)).permute(0, 2, 3, 1)[share > 0.05])
     stacked = torch.cat(latents)
     return stacked.mean(0).tolist(), stacked.std(0).tolist()

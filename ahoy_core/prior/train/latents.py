@@ -12,8 +12,7 @@ import torch
 from numpy.typing import NDArray
 from safetensors import safe_open
 from safetensors.torch import save_file
-from torch import Tensor
-from torch.nn import functional as F
+from torch import Tensor, nn
 
 from ahoy_core.formats.atomic import atomic_path
 from ahoy_core.prior.autoencoder import FACTOR, FrameAutoencoder
@@ -68,8 +67,8 @@ def encode_shard(vae: FrameAutoencoder, shard: Path, folder: Path) -> Path:
     tensors = {
         "pictures": _encoded(vae, arrays["image"]),
         "coarse": _encoded(vae, arrays["coarse"]),
-        "weight": F.avg_pool2d(mask, FACTOR).half(),
-        "coverage": F.avg_pool2d(torch.minimum(coverage, mask), FACTOR).half(),
+        "weight": nn.functional.avg_pool2d(mask, FACTOR).half(),
+        "coverage": nn.functional.avg_pool2d(torch.minimum(coverage, mask), FACTOR).half(),
         "held": held_tokens(coverage, mask),
         **{name: torch.from_numpy(arrays[name]) for name in ("body", "azimuth", "observed")},
     }

@@ -139,7 +139,7 @@ def _set_rate(state: TrainState, schedule: Schedule, share: float) -> None:
 def _update(state: TrainState, value: Tensor, schedule: Schedule) -> None:
     if not bool(torch.isfinite(value)):
         raise FloatingPointError(
-            f"expected a finite loss, got {float(value)} at step {state.step}; resume from the checkpoint with a lower rate"
+            f"expected a finite loss, got {float(value)} at step {state.step}; resume with a lower rate"
         )
     for optimizer in (state.matrices, state.vectors):
         optimizer.zero_grad(set_to_none=True)
