@@ -123,13 +123,13 @@ def encode_corpus(corpus: Path, folder: Path, note: Callable[[str], None], limit
     latents.mkdir(exist_ok=True)
     held_out = [path for split in SPLITS if split != "train" for path in shards(corpus, split)[:1]]
     train = shards(corpus, "train")[:limit]
-    for path in [*train[:2], *held_out, *train[2:]]:
+    for path in [*train[:2], *held_out[:2], *train[2:4], *held_out[2:], *train[4:]]:
         if not (latents / path.name).exists():
             note(encode_shard(vae, path, latents).name)
 
 
 def train_flow(
-    folder: Path, schedule: Schedule, note: Callable[[Row], None], batch: int = 16, size: tuple[int, int] = (160, 5)
+    folder: Path, schedule: Schedule, note: Callable[[Row], None], batch: int = 10, size: tuple[int, int] = (128, 5)
 ) -> None:
     """Trains transformer and text encoder on `folder/latents`, or goes on; writes the whole prior to `folder/prior`.
 

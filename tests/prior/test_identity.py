@@ -45,7 +45,9 @@ def velocity(video: VideoModel, channels: int, tau: float) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_a_saved_subject_gives_the_same_velocity_bit_by_bit(form: str, folders: dict[str, Path], tmp_path: Path) -> None:
+def test_a_saved_subject_gives_the_same_velocity_bit_by_bit(
+    form: str, folders: dict[str, Path], tmp_path: Path
+) -> None:
     channels = 48 if form == "5b" else 16
     video = load_video(folders[form])
     before = [velocity(video, channels, tau) for tau in (0.95, 0.3)]

@@ -60,7 +60,9 @@ def test_held_latents_come_out_as_they_went_in(embedded: VideoModel) -> None:
     context = Context(embedded.embed(["a person"]), known=noise(5), held=held)
     inside = held_latents(held).expand(SHAPE)
     neutral = embedded.embed([""])
-    result = hallucinate(embedded, noise(6), context, neutral, InversionConfig(steps=2), torch.Generator().manual_seed(0))
+    result = hallucinate(
+        embedded, noise(6), context, neutral, InversionConfig(steps=2), torch.Generator().manual_seed(0)
+    )
     assert torch.equal(result.latents[inside], noise(5)[inside])
     assert not torch.allclose(result.latents[~inside], noise(6)[~inside])
     assert torch.equal(clean_up(embedded, noise(7), context, steps=2).latents[inside], noise(5)[inside])

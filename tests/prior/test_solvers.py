@@ -54,7 +54,9 @@ FIELDS = {
 def test_error_falls_with_the_order_of_the_solver(solver: Solver, name: str) -> None:
     field, exact, start = FIELDS[name]
     steps = np.array([16, 24, 32, 48, 64])
-    errors = [float((solve(field, start, sigma_grid(0, 1, int(n)), solver).state - exact(start, 1.0)).norm()) for n in steps]
+    errors = [
+        float((solve(field, start, sigma_grid(0, 1, int(n)), solver).state - exact(start, 1.0)).norm()) for n in steps
+    ]
     slope = -np.polyfit(np.log(steps), np.log(errors), 1)[0]
     # Next-order terms bend the line a little at 16 steps; a neighbouring order would be off by 1.
     assert slope == pytest.approx(ORDERS[solver], abs=0.25), errors
@@ -65,7 +67,8 @@ def test_backwards_in_time_has_the_same_order(solver: Solver) -> None:
     start = FIELDS["rotating"][2]
     steps = np.array([16, 32, 64])
     errors = [
-        float((solve(rotating, rotated(start, 1.0), sigma_grid(1, 0, int(n)), solver).state - start).norm()) for n in steps
+        float((solve(rotating, rotated(start, 1.0), sigma_grid(1, 0, int(n)), solver).state - start).norm())
+        for n in steps
     ]
     assert -np.polyfit(np.log(steps), np.log(errors), 1)[0] == pytest.approx(ORDERS[solver], abs=0.25)
 
