@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ahoy_core.body.lbs import forward_kinematics, lbs
 from ahoy_core.body.packaged import PackagedBody
-from ahoy_core.conventions import GREY, PERSON_HEIGHT_SHARE, Cameras, look_at, orbit_eyes
+from ahoy_core.conventions import GREY, PERSON_HEIGHT_SHARE, CameraModel, Cameras, look_at, orbit_eyes
 from ahoy_core.prior.bodymaps import body_maps
 from ahoy_core.prior.corpus.coarse import View, coarse_frames, random_occluder
 from ahoy_core.prior.corpus.dress import KINDS, Dressed, vertex_normals
@@ -22,13 +22,12 @@ from ahoy_core.prior.corpus.poses import ACTIONS, HELD_OUT_ACTIONS, Action, acti
 from ahoy_core.prior.corpus.prompts import WEARABLES, caption
 from ahoy_core.prior.corpus.shade import Light, Surface, shade, surface
 from ahoy_core.prior.corpus.wardrobe import Split
+from ahoy_core.prior.framing import HEIGHT, WIDTH, framing_Ks
 from ahoy_core.prior.raster import Hits, rasterize
 
 Array = NDArray[Any]
 
 FRAMES: Final = 8
-HEIGHT: Final = 128
-WIDTH: Final = 64
 SAMPLES: Final = 2  # along each axis of a pixel
 BACKGROUND_PART: Final = 255
 
@@ -148,28 +147,16 @@ def _azimuths(rng: np.random.Generator, turning: bool) -> Tensor:
 
 
 def _framed(rng: np.random.Generator, bare: Tensor, azimuth: Tensor) -> Cameras:
-    """Cameras round the person that frame the bare body at 90% of the height (or of the width), a little jittered."""
-    points = bare[:, ::7]
-    center = 0.5 * (points.amin((0, 1)) + points.amax((0, 1)))
-    ortho = bool(rng.random() < 0.3)
+    """Cameras round the person that frame the bare body, a little jittered."""
+    center = 0.5 * (bare.amin((0, 1)) + bare.amax((0, 1)))
+    model: CameraModel = "ortho" if rng.random() < 0.3 else "pinhole"
     radius, elevation = float(rng.uniform(2.5, 8)), float(rng.choice([0.0, rng.uniform(-0.1, 0.25)]))
     viewmats = look_at(orbit_eyes(center, radius, azimuth, elevation), center)
-    unit = torch.eye(3).expand(FRAMES, 3, 3).contiguous()
-    flat = Cameras(viewmats, unit, WIDTH, HEIGHT, "ortho" if ortho else "pinhole").project(
-        points.expand(FRAMES, -1, -1)
-    )
-    low, high = flat.pixels.amin(1), flat.pixels.amax(1)
-    if rng.random() < 0.88:  # one framing for all frames
-        low, high = low.amin(0).expand(FRAMES, 2), high.amax(0).expand(FRAMES, 2)
-    extent = high - low
     share = PERSON_HEIGHT_SHARE * float(rng.uniform(0.95, 1.02))
-    scale = share * torch.minimum(HEIGHT / extent[:, 1], WIDTH / extent[:, 0])
-    shift = torch.tensor([WIDTH / 2, HEIGHT / 2]) + torch.tensor(rng.normal(0, 0.7, 2), dtype=torch.float32)
-    Ks = torch.zeros(FRAMES, 3, 3)
-    Ks[:, 0, 0] = Ks[:, 1, 1] = scale
-    Ks[:, :2, 2] = shift - scale[:, None] * 0.5 * (low + high)
-    Ks[:, 2, 2] = 1
-    return Cameras(viewmats, Ks, WIDTH, HEIGHT, "ortho" if ortho else "pinhole")
+    together = bool(rng.random() < 0.88)
+    Ks = framing_Ks(viewmats, bare.expand(FRAMES, -1, -1), HEIGHT, WIDTH, model, share, together)
+    Ks[:, :2, 2] += torch.tensor(rng.normal(0, 0.7, 2), dtype=torch.float32)
+    return Cameras(viewmats, Ks, WIDTH, HEIGHT, model)
 
 
 def _lights(rng: np.random.Generator, scene: Scene) -> list[Light]:

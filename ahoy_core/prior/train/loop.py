@@ -180,7 +180,9 @@ def save_state(state: TrainState, path: Path) -> None:
             tensors |= {f"{label}.{index}.{key}": value for key, value in entry.items()}
     meta = {"step": state.step, "seconds": state.seconds, "seed": state.seed}
     with atomic_path(path) as temporary:
-        save_file({key: value.clone().contiguous() for key, value in tensors.items()}, temporary, {"ahoy": json.dumps(meta)})
+        save_file(
+            {key: value.clone().contiguous() for key, value in tensors.items()}, temporary, {"ahoy": json.dumps(meta)}
+        )
 
 
 def load_state(state: TrainState, path: Path) -> None:
