@@ -71,10 +71,11 @@ def train(
 def encode(
     corpus_folder: Annotated[Path, typer.Option("--corpus", help="Folder of shards.")],
     out: Annotated[Path, typer.Option(help="Folder of the prior, with its finished autoencoder.")],
+    every: Annotated[int, typer.Option(help="Take every so many clips of a shard.", min=1)] = 1,
     threads: Annotated[int, typer.Option(help="Threads.", min=1)] = 1,
 ) -> None:
     """Turn shards into the latents that the flow is trained on; what is there stays."""
     from tasks import prior_training
 
     torch.set_num_threads(threads)
-    prior_training.encode_corpus(corpus_folder, out, lambda name: console.print(name, highlight=False))
+    prior_training.encode_corpus(corpus_folder, out, lambda name: console.print(name, highlight=False), every)

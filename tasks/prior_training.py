@@ -104,14 +104,14 @@ def train_autoencoder(
         model.save_pretrained(folder / AUTOENCODER)
 
 
-def encode_corpus(corpus: Path, folder: Path, note: Callable[[str], None], limit: int | None = None) -> None:
+def encode_corpus(corpus: Path, folder: Path, note: Callable[[str], None], every: int = 1) -> None:
     """Writes the latents of every shard of a corpus to `folder/latents`, held-out splits first.
 
     Args:
         corpus: folder of shards.
         folder: of this prior, with its finished autoencoder.
         note: called with each new file's name.
-        limit: number of training shards at most.
+        every: take every so many clips of a shard.
     """
     from ahoy_core.prior.autoencoder import FrameAutoencoder
     from ahoy_core.prior.corpus.shards import shards
@@ -122,14 +122,14 @@ def encode_corpus(corpus: Path, folder: Path, note: Callable[[str], None], limit
     latents = folder / "latents"
     latents.mkdir(exist_ok=True)
     held_out = [path for split in SPLITS if split != "train" for path in shards(corpus, split)[:1]]
-    train = shards(corpus, "train")[:limit]
+    train = shards(corpus, "train")
     for path in [*train[:2], *held_out[:2], *train[2:4], *held_out[2:], *train[4:]]:
         if not (latents / path.name).exists():
-            note(encode_shard(vae, path, latents).name)
+            note(encode_shard(vae, path, latents, every).name)
 
 
 def train_flow(
-    folder: Path, schedule: Schedule, note: Callable[[Row], None], batch: int = 10, size: tuple[int, int] = (128, 5)
+    folder: Path, schedule: Schedule, note: Callable[[Row], None], batch: int = 10, size: tuple[int, int] = (160, 4)
 ) -> None:
     """Trains transformer and text encoder on `folder/latents`, or goes on; writes the whole prior to `folder/prior`.
 

@@ -16,6 +16,8 @@ LATENT_CHANNELS: Final = 16
 _BODY: Final = CHANNELS * (FACTOR // CELL) ** 2  # 28: the maps' cells of one latent
 # Azimuth (sine, cosine), body known, place in the picture (x, y), coarse known, coverage.
 _FLAGS: Final = 7
+COARSE_START: Final = LATENT_CHANNELS + _BODY + 3
+"""First channel of the coarse latents in the transformer's input."""
 INPUT_CHANNELS: Final = LATENT_CHANNELS + _BODY + LATENT_CHANNELS + _FLAGS
 
 

@@ -56,12 +56,20 @@ class LatentClips:
 
 
 @torch.no_grad()
-def encode_shard(vae: FrameAutoencoder, shard: Path, folder: Path) -> Path:
-    """Writes the latents of a shard to `folder`, unless they are there."""
+def encode_shard(vae: FrameAutoencoder, shard: Path, folder: Path, every: int = 1) -> Path:
+    """Writes the latents of a shard to `folder`, unless they are there.
+
+    Args:
+        vae: with latent statistics.
+        shard: of the corpus.
+        folder: of latents; exists.
+        every: take every so many clips; neighbours differ in paint and light alone.
+    """
     path = folder / shard.name
     if path.exists():
         return path
     arrays, meta = read_shard(shard, _ARRAYS)
+    arrays = {name: array[::every] for name, array in arrays.items()}
     mask = torch.from_numpy(arrays["mask"]).float() / 255
     coverage = torch.from_numpy(arrays["coverage"]).float() / 255
     tensors = {
@@ -73,7 +81,7 @@ def encode_shard(vae: FrameAutoencoder, shard: Path, folder: Path) -> Path:
         **{name: torch.from_numpy(arrays[name]) for name in ("body", "azimuth", "observed")},
     }
     with atomic_path(path) as temporary:
-        save_file(tensors, temporary, {"ahoy": json.dumps({"prompts": meta["prompts"]})})
+        save_file(tensors, temporary, {"ahoy": json.dumps({"prompts": meta["prompts"][::every]})})
     return path
 
 
