@@ -14,7 +14,7 @@ def build_transformer(width: int = 192, layers: int = 6, heads: int = 4) -> Any:
     """An untrained `WanTransformer3DModel` (velocity = noise - data, timesteps 1000 tau, one per token).
 
     Args:
-        width: channels; from `2 * LATENT_CHANNELS * PATCH**2` on, the training starts where pure noise becomes the coarse
+        width: channels; from 2 * LATENT_CHANNELS * PATCH**2 on, training starts where pure noise becomes the coarse
             latents (`_pass_coarse_through`).
         layers: blocks.
         heads: of attention; their size, width / heads, is even.

@@ -69,7 +69,7 @@ def encode_shard(vae: FrameAutoencoder, shard: Path, folder: Path, every: int = 
     if path.exists():
         return path
     arrays, meta = read_shard(shard, _ARRAYS)
-    arrays = {name: array[::every] for name, array in arrays.items()}
+    arrays = {name: np.ascontiguousarray(array[::every]) for name, array in arrays.items()}
     mask = torch.from_numpy(arrays["mask"]).float() / 255
     coverage = torch.from_numpy(arrays["coverage"]).float() / 255
     tensors = {
