@@ -22,6 +22,7 @@ from ahoy_core.body.packaged import PackagedBody, load_packaged_body
 from ahoy_core.body.rotations import axis_angle_to_matrix
 from ahoy_core.conventions import Cameras
 from ahoy_core.cost import machine
+from ahoy_core.prior.canonical import CanonicalFill, check_prior
 from ahoy_core.prior.conditioning import Context
 from ahoy_core.prior.corpus.prompts import NEUTRAL
 from ahoy_core.prior.corpus.shards import shards
@@ -41,6 +42,8 @@ from ahoy_core.prior.subject import subject_frames
 from ahoy_core.prior.text import IDENTITY_PROMPT
 from ahoy_core.prior.train.frames import autoencoder_psnr
 from ahoy_core.prior.video import VideoModel, load_video
+from ahoy_core.texture.atlas import ObservedAtlas
+from ahoy_core.texture.texture import TextureConfig, build_texture
 from benchmarks.captures import Capture, capture_folders, posed_vertices, read_capture, true_fit
 
 _BUDGETS = (8, 16, 32)
@@ -140,7 +143,11 @@ def capture_figures(load: Callable[[], VideoModel], capture: Capture, body: Pack
     for name in _BANDS:
         weight = band_weight(views, name)
         flat = torch.where(weight > 0, colours(views.images[:1], weight[:1])[:, None, None], flat)
-    found: dict[str, Any] = {"static_from_front": {}, "identity": {}}
+    found: dict[str, Any] = {
+        "self_check": self_checked(video, capture, body),
+        "static_from_front": {},
+        "identity": {},
+    }
     for name in _BANDS:
         weight = band_weight(views, name)[1:]
         for label, made in (("prior", turned), ("mirror", mirror), ("colours", flat)):
@@ -157,6 +164,15 @@ def capture_figures(load: Callable[[], VideoModel], capture: Capture, body: Pack
         for label, made in (("before", before), ("after", after)):
             found["identity"][f"colour_distance_{label}/{name}"] = float((colours(made, weight) - truth).norm())
     return found
+
+
+def self_checked(video: VideoModel, capture: Capture, body: PackagedBody) -> dict[str, Any]:
+    """The self-check on a capture's texture, from the true body."""
+    fit = true_fit(capture, body)
+    texture = build_texture(capture.frames, capture.visible, fit, body, TextureConfig(atlas_size=256, frame_stride=4))
+    observed = ObservedAtlas(texture.observed_rgb, texture.coverage, texture.source_frame)
+    check = check_prior(video, CanonicalFill(body, fit["betas"], observed))
+    return {"errors": check.errors, "winner": check.winner, "regions": check.regions, "pixels": check.pixels}
 
 
 def main() -> None:

@@ -5,11 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from diffusers.configuration_utils import ConfigMixin, register_to_config
-from diffusers.models.modeling_utils import ModelMixin
 from torch import Tensor, nn
 
-FACTOR = 8  # pixels a latent, along each axis
+from ahoy_core.prior.conditioning import FACTOR
+
+try:
+    from diffusers.configuration_utils import ConfigMixin, register_to_config
+    from diffusers.models.modeling_utils import ModelMixin
+except ImportError as error:
+    raise ImportError("expected the package diffusers, got none; run pip install 'ahoy-avatars[prior]'") from error
 
 
 class _Residual(nn.Module):

@@ -8,9 +8,9 @@ from typing import Final
 import torch
 from torch import Tensor, nn
 
-from ahoy_core.prior.autoencoder import FACTOR
 from ahoy_core.prior.bodymaps import CELL, CHANNELS
 
+FACTOR: Final = 8  # pixels a latent, along each axis
 PATCH: Final = 2  # latents a token, along each axis
 LATENT_CHANNELS: Final = 16
 _BODY: Final = CHANNELS * (FACTOR // CELL) ** 2  # 28: the maps' cells of one latent

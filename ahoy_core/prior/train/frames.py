@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from ahoy_core.conventions import GREY
-from ahoy_core.prior.autoencoder import FACTOR, FrameAutoencoder
+from ahoy_core.prior.autoencoder import FrameAutoencoder
+from ahoy_core.prior.conditioning import FACTOR
 from ahoy_core.prior.corpus.shards import read_shard, shards
 from ahoy_core.prior.train.loop import Row
 

@@ -15,8 +15,8 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from ahoy_core.formats.atomic import atomic_path
-from ahoy_core.prior.autoencoder import FACTOR, FrameAutoencoder
-from ahoy_core.prior.conditioning import held_tokens
+from ahoy_core.prior.autoencoder import FrameAutoencoder
+from ahoy_core.prior.conditioning import FACTOR, held_tokens
 from ahoy_core.prior.corpus.shards import read_shard
 from ahoy_core.prior.train.frames import to_model
 
