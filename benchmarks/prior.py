@@ -26,21 +26,12 @@ from ahoy_core.prior.canonical import CanonicalFill, check_prior
 from ahoy_core.prior.conditioning import Context
 from ahoy_core.prior.corpus.prompts import NEUTRAL
 from ahoy_core.prior.corpus.shards import shards
-from ahoy_core.prior.corpus.wardrobe import SPLITS
-from ahoy_core.prior.evaluate import (
-    back_from_front,
-    load_clips,
-    psnr,
-    repair_methods,
-    repaired,
-    round_trips,
-)
+from ahoy_core.prior.evaluate import held_out, load_clips, psnr, round_trips
 from ahoy_core.prior.identity import Frames, IdentityConfig, train_identity
 from ahoy_core.prior.inversion import clean_up
 from ahoy_core.prior.solvers import EVALUATIONS
 from ahoy_core.prior.subject import subject_frames
 from ahoy_core.prior.text import IDENTITY_PROMPT
-from ahoy_core.prior.train.frames import autoencoder_psnr
 from ahoy_core.prior.video import VideoModel, load_video
 from ahoy_core.texture.atlas import ObservedAtlas
 from ahoy_core.texture.texture import TextureConfig, build_texture
@@ -50,30 +41,6 @@ _BUDGETS = (8, 16, 32)
 _CAMERAS = ("front", "left", "back", "right")
 _BANDS = {"torso": (0.1, 0.6), "legs": (-0.85, -0.1)}  # of the body's height in [-1,1]
 _IDENTITY_FRAMES = 12
-
-
-def held_out(video: VideoModel, corpus: Path, clips: int) -> dict[str, Any]:
-    """Figures on the splits that the prior was not trained on."""
-    found: dict[str, Any] = {}
-    for split in SPLITS:
-        paths = shards(corpus, split)
-        if not paths or split == "train":
-            continue
-        turns = load_clips(paths[0], clips)
-        back = back_from_front(video, turns)
-        found[split] = {
-            "autoencoder_psnr_mask": autoencoder_psnr(video.components.vae, paths[0]),
-            "clips": len(turns),
-            "back_from_front": back,
-            "back_gain": {
-                f"{made} over {base}, {region}": back[f"{made}/{region}"] - back[f"{base}/{region}"]
-                for made in ("mean", "sample")
-                for base in ("mirror", "colours")
-                for region in ("torso", "legs")
-            },
-            "repaired": repaired(video, load_clips(paths[0], clips, turning=False), repair_methods(video)),
-        }
-    return found
 
 
 def static_views(capture: Capture, body: PackagedBody) -> Frames:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Annotated
 
@@ -79,3 +80,34 @@ def encode(
 
     torch.set_num_threads(threads)
     prior_training.encode_corpus(corpus_folder, out, lambda name: console.print(name, highlight=False), every)
+
+
+@app.command("eval")
+def evaluate(
+    prior: Annotated[Path, typer.Argument(help="Folder of a prior.")],
+    corpus_folder: Annotated[Path, typer.Option("--corpus", help="Folder of shards, held-out splits among them.")],
+    out: Annotated[Path, typer.Option(help="JSON file to write.")],
+    clips: Annotated[int, typer.Option(help="Clips of each split.", min=1)] = 24,
+    threads: Annotated[int, typer.Option(help="Threads.", min=1)] = 1,
+) -> None:
+    """Measure a prior on people, garments and motions that it was not trained on."""
+    from ahoy_core.prior.evaluate import held_out
+    from ahoy_core.prior.video import load_video
+
+    torch.set_num_threads(threads)
+    figures = held_out(load_video(prior), corpus_folder, clips)
+    out.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
+    console.print_json(data=figures)
+
+
+@app.command()
+def card(
+    folder: Annotated[Path, typer.Argument(help="Folder of the trainings.")],
+    corpus_folder: Annotated[Path, typer.Option("--corpus", help="Folder of shards.")],
+    figures: Annotated[Path, typer.Option(help="What `ahoy prior eval` wrote.")],
+) -> None:
+    """Write the model card: data, licence, splits, seeds, curves, figures."""
+    from tasks.prior_card import write_card
+
+    path = write_card(folder, corpus_folder, json.loads(figures.read_text(encoding="utf-8")))
+    console.print(str(path), highlight=False)

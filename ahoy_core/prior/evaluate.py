@@ -17,9 +17,11 @@ from torch import Tensor
 from ahoy_core.prior.conditioning import Context, held_tokens
 from ahoy_core.prior.corpus.dress import KINDS, Kind
 from ahoy_core.prior.corpus.prompts import NEUTRAL
-from ahoy_core.prior.corpus.shards import read_shard
+from ahoy_core.prior.corpus.shards import read_shard, shards
+from ahoy_core.prior.corpus.wardrobe import SPLITS
 from ahoy_core.prior.inversion import InversionConfig, clean_up, hallucinate
 from ahoy_core.prior.solvers import Solver, sigma_grid, solve, steps_for
+from ahoy_core.prior.train.frames import autoencoder_psnr
 from ahoy_core.prior.video import VideoModel
 
 Array = NDArray[Any]
@@ -132,6 +134,36 @@ def context_of(
         coarse=video.encode(clips.coarse.transpose(1, 2)) if coarse else None,
         coverage=seen if coarse else None,
     )
+
+
+def held_out(video: VideoModel, corpus: Path, clips: int) -> dict[str, Any]:
+    """Figures on the first shard of each split that the prior was not trained on.
+
+    Args:
+        video: the prior.
+        corpus: folder of shards.
+        clips: of each split, at most.
+    """
+    found: dict[str, Any] = {}
+    for split in SPLITS:
+        paths = shards(corpus, split)
+        if not paths or split == "train":
+            continue
+        turns = load_clips(paths[0], clips)
+        back = back_from_front(video, turns)
+        found[split] = {
+            "autoencoder_psnr_mask": autoencoder_psnr(video.components.vae, paths[0]),
+            "clips": len(turns),
+            "back_from_front": back,
+            "back_gain": {
+                f"{made} over {base}, {region}": back[f"{made}/{region}"] - back[f"{base}/{region}"]
+                for made in ("mean", "sample")
+                for base in ("mirror", "colours")
+                for region in ("torso", "legs")
+            },
+            "repaired": repaired(video, load_clips(paths[0], clips, turning=False), repair_methods(video)),
+        }
+    return found
 
 
 @torch.no_grad()
