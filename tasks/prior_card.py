@@ -26,8 +26,8 @@ motion, and what was seen of a person, it proposes what was not seen. It knows n
   body (Anny, Apache-2.0; data CC0) with MakeHuman's CC0 clothes, shoes, hair and eyebrows, procedural garments, prints
   and skin tones. Nothing else.
 - **Splits**: trained on suits {suits}, shoes {shoes}, hair {hair}, actions {actions}. Held out: new people;
-  the meshes {held_suits}, {held_shoes}, {held_hair}; the textures of {untextured}; the actions {held_actions}. In no split, because
-  the development captures wear them: {never}.
+  the meshes {held_suits}, {held_shoes}, {held_hair}; the textures of {untextured}; the actions {held_actions}.
+  In no split, because the development captures wear them: {never}.
 - **Model**: {model}.
 - **Training**: {training}. Seeds 0 (autoencoder) and 1 (flow).
 - **Limits**: one person over grey at 128 x 64; prints on an unseen back cannot be known; faces are rendered
@@ -90,9 +90,9 @@ def _model(out: Path) -> str:
     width = config["num_attention_heads"] * config["attention_head_dim"]
     megabytes = sum(path.stat().st_size for path in out.rglob("*.safetensors")) / 2**20
     return (
-        f"`WanTransformer3DModel` of width {width} and {config['num_layers']} layers with {config['in_channels']} input "
-        f"channels (latents, body maps, azimuth, coarse latents, coverage); `FrameAutoencoder`, 8x down, 16 channels; "
-        f"`UMT5EncoderModel` with its own vocabulary; {megabytes:.1f} MB of weights"
+        f"`WanTransformer3DModel` of width {width} and {config['num_layers']} layers with {config['in_channels']} "
+        "input channels (latents, body maps, azimuth, coarse latents, coverage); `FrameAutoencoder`, 8x down, 16 "
+        f"channels; `UMT5EncoderModel` with its own vocabulary; {megabytes:.1f} MB of weights"
     )
 
 

@@ -106,8 +106,8 @@ def random_clip(rng: np.random.Generator, scene: Scene) -> Clip:
     totals: dict[str, list[Array]] = {kind: [] for kind in WEARABLES}
     for t, (covered, light) in enumerate(zip(scene.surfaces, lights, strict=True)):
         colour = shade(covered, paint, scene.person, light)
-        image[t].reshape(-1, 3)[covered.index] = colour
-        mask[t].reshape(-1)[covered.index] = 1
+        image[t].reshape(-1, 3)[covered.pixels] = colour
+        mask[t].reshape(-1)[covered.pixels] = 1
         for kind in totals:
             totals[kind].append(colour[covered.material == KINDS.index(kind)])
     image, mask = _pooled(image), _pooled(mask)

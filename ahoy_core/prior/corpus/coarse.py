@@ -18,7 +18,7 @@ class View(NamedTuple):
     """One frame at the person image's size, sampled once a pixel.
 
     Attributes:
-        index: [N] covered pixels.
+        pixels: [N] covered ones.
         corners: [N,3] vertices of the triangle that each sees.
         bary: [N,3] their weights.
         material: [N].
@@ -29,7 +29,7 @@ class View(NamedTuple):
         occluded: [H,W] bool: something stands in front of the person here.
     """
 
-    index: Array
+    pixels: Array
     corners: Array
     bary: Array
     material: Array
@@ -71,7 +71,7 @@ def coarse_frames(views: list[View], observed: list[int], rng: np.random.Generat
     pictures = np.full((len(views), *size, 3), grey, dtype=np.float32)
     coverage = np.zeros((len(views), *size), dtype=np.float32)
     for t, view in enumerate(views):
-        colour, seen = _band_lookup(view, bands), np.zeros(len(view.index), dtype=bool)
+        colour, seen = _band_lookup(view, bands), np.zeros(len(view.pixels), dtype=bool)
         for k in reversed(observed):
             source = views[k]
             row, column, depth = _landing(view, source, size)
@@ -80,8 +80,8 @@ def coarse_frames(views: list[View], observed: list[int], rng: np.random.Generat
             used = visible | (there & ~seen & through)
             colour[used] = source.colour[row[used], column[used]]
             seen |= visible
-        pictures[t].reshape(-1, 3)[view.index] = colour
-        coverage[t].reshape(-1)[view.index] = seen
+        pictures[t].reshape(-1, 3)[view.pixels] = colour
+        coverage[t].reshape(-1)[view.pixels] = seen
         pictures[t] = _degraded(pictures[t], view, coverage[t], sigma, rng, grey)
     return pictures, coverage
 
@@ -103,9 +103,9 @@ def _band_colours(views: list[View], observed: list[int]) -> Array:
     total, count = np.zeros((8, _BANDS, 4)), np.zeros((8, _BANDS, 1))
     for k in observed:
         view = views[k]
-        shown = ~view.occluded.ravel()[view.index]
+        shown = ~view.occluded.ravel()[view.pixels]
         keys = view.material[shown], _band(view)[shown]
-        np.add.at(total[..., :3], keys, view.colour.reshape(-1, 3)[view.index[shown]])
+        np.add.at(total[..., :3], keys, view.colour.reshape(-1, 3)[view.pixels[shown]])
         np.add.at(count, keys, 1.0)
     known = count[..., 0] > 3
     if not known.any():
@@ -131,7 +131,7 @@ def _degraded(
 ) -> Array:
     """Blur, most where nothing was observed, and a few blotches there, within the silhouette."""
     inside = np.zeros(picture.shape[:2], dtype=np.float32)
-    inside.reshape(-1)[view.index] = 1
+    inside.reshape(-1)[view.pixels] = 1
     blurred = cv2.GaussianBlur(picture, (0, 0), sigma + 0.8)
     soft = cv2.GaussianBlur(picture, (0, 0), sigma)
     mixed = np.where(coverage[..., None] > 0, soft, blurred)

@@ -16,7 +16,7 @@ Array = NDArray[Any]
 
 _kernel = numba.njit(nogil=True, cache=True, error_model="numpy")
 
-_SKIN, _EYES, _HAIR = KINDS.index("skin"), KINDS.index("eyes"), KINDS.index("hair")
+_SKIN, _EYES = KINDS.index("skin"), KINDS.index("eyes")
 _LIP, _IRIS = 0.011, 0.0055  # metres
 
 
@@ -29,9 +29,9 @@ class Light(NamedTuple):
 
 
 class Surface(NamedTuple):
-    """Per pixel of N covered ones: index [N] into the image, material [N], texture [N,3], normal [N,3], rest [N,3]."""
+    """Per pixel of N covered ones: number in the image [N], material [N], texture [N,3], normal [N,3], rest [N,3]."""
 
-    index: Array
+    pixels: Array
     material: Array
     texture: Array
     normal: Array
@@ -59,7 +59,7 @@ def surface(hits: Hits, person: Dressed, normals: Array) -> Surface:
 
 def shade(surface_: Surface, rows: Array, person: Dressed, light: Light) -> Array:
     """Colours [N,3] float32 sRGB in [0,1] of the covered pixels."""
-    out = np.empty((len(surface_.index), 3), dtype=np.float32)
+    out = np.empty((len(surface_.pixels), 3), dtype=np.float32)
     direction = (light.direction / np.linalg.norm(light.direction)).astype(np.float32)
     _shade(
         surface_.material, surface_.texture, surface_.normal, surface_.rest, rows, person.features,

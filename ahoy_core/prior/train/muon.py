@@ -62,7 +62,8 @@ class Muon(torch.optim.Optimizer):
 
 def split_parameters(model: nn.Module, plain: tuple[str, ...] = ()) -> tuple[list[nn.Parameter], list[nn.Parameter]]:
     """Parameters for Muon (matrices and kernels) and for AdamW (vectors, and names that contain one of `plain`)."""
-    matrices, rest = [], []
+    matrices: list[nn.Parameter] = []
+    rest: list[nn.Parameter] = []
     for name, parameter in model.named_parameters():
         if parameter.requires_grad:
             fits = parameter.ndim >= 2 and not any(part in name for part in plain)
