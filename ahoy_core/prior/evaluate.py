@@ -60,8 +60,9 @@ class Clips:
     def __len__(self) -> int:
         return len(self.frames)
 
-    def __getitem__(self, rows: Tensor) -> Clips:
-        return Clips(**{name: value[rows] for name, value in self.__dict__.items()})
+    def views(self, frames: list[int]) -> Clips:
+        """The same clips with some of their frames."""
+        return Clips(**{name: value[:, frames] for name, value in self.__dict__.items()})
 
 
 def load_clips(shard: Path, limit: int, turning: bool = True) -> Clips:
