@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from flows import batch_cli, export_cli, models_cli, plan_cli, render_cli, server_cli, store_cli, view_cli
+from flows import batch_cli, export_cli, models_cli, plan_cli, prior_cli, render_cli, server_cli, store_cli, view_cli
 from storage_schema.secrets import RedactSecrets
 
 if TYPE_CHECKING:
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 app.add_typer(models_cli.app, name="models")
+app.add_typer(prior_cli.app, name="prior")
 app.add_typer(store_cli.app, name="store")
 COMMANDS = (
     *(batch_cli.submit, batch_cli.status, batch_cli.rerun, batch_cli.cancel, batch_cli.logs, plan_cli.plan),

@@ -1,0 +1,84 @@
+"""The canonical views of a video's texture, as the prior sees them; and the symmetric fill that it has to beat."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ahoy_core.body.packaged import PackagedBody
+from ahoy_core.conventions import GREY, canonical_cameras
+from ahoy_core.prior.completion import Pictures, PriorConfig, pose_context, repaint
+from ahoy_core.prior.framing import HEIGHT, WIDTH
+from ahoy_core.prior.selfcheck import SelfCheck, self_check
+from ahoy_core.prior.video import VideoModel
+from ahoy_core.texture.atlas import ObservedAtlas
+from ahoy_core.texture.canonical import canonical_views
+from ahoy_core.texture.fill import fill_atlas
+from ahoy_core.texture.surface import Surface
+from ahoy_core.texture.texels import texel_map
+from ahoy_core.texture.texture import canonical_vertices
+
+Array = NDArray[Any]
+
+CLEAN_UP = "prior, clean-up"
+INVERSION = "prior, inversion"
+
+
+class CanonicalFill:
+    """From what stays observed of a texture to its four canonical views, completed by symmetry and diffusion.
+
+    Args:
+        body: the packaged body.
+        betas: [S] the subject's shape.
+        observed: the atlas of the video.
+
+    Attributes:
+        points: [N,3] of the atlas' texels in canonical pose, metres.
+        observed: [N] bool, texels that the video showed.
+        maps: body maps [1,4,7,32,16] of the four views, front, left, back, right.
+        azimuth: [1,4] radians.
+    """
+
+    def __init__(self, body: PackagedBody, betas: Array, observed: ObservedAtlas) -> None:
+        self._atlas = observed
+        self._surface = Surface.of(body)
+        self._texels = texel_map(self._surface, len(observed.coverage))
+        self._vertices = canonical_vertices(body, betas)
+        self.points = self._texels.points(self._vertices, self._surface.faces)
+        self.observed: Array = observed.coverage.ravel()[self._texels.flat] > 0
+        vertices = torch.from_numpy(self._vertices)
+        cameras = canonical_cameras(vertices, HEIGHT, WIDTH)
+        upright = torch.eye(3).expand(4, 3, 3)
+        self.maps, self.azimuth = pose_context(body, vertices.expand(4, -1, -1), upright, cameras)
+
+    def __call__(self, kept: Tensor) -> Pictures:
+        """The completed views if only the texels `kept` [N] had been observed."""
+        size = len(self._atlas.coverage)
+        known = np.zeros(size * size, dtype=bool)
+        known[self._texels.flat[kept.numpy()]] = True
+        known = known.reshape(size, size)
+        atlas = ObservedAtlas(
+            rgb=np.where(known[..., None], self._atlas.rgb, 0).astype(np.uint8),
+            coverage=np.where(known, self._atlas.coverage, 0).astype(np.float32),
+            source_frame=np.where(known, self._atlas.source_frame, -1).astype(np.int32),
+        )
+        filled = fill_atlas(atlas, self._surface, self._texels, self._vertices)
+        made = canonical_views(self._surface, self._texels, self._vertices, atlas, filled.rgb, HEIGHT, WIDTH)
+        rgba = torch.from_numpy(made.views).permute(0, 3, 1, 2).float() / 255
+        alpha = rgba[:, 3:]
+        coverage = torch.from_numpy(made.coverage)[:, None].float() / 255
+        return Pictures(rgba[:, :3] * alpha + GREY * (1 - alpha), alpha, coverage)
+
+
+def check_prior(video: VideoModel, fill: CanonicalFill, seed: int = 0, regions: int = 3) -> SelfCheck:
+    """The prior's two ways against the symmetric fill on hidden parts of what a video showed."""
+
+    def by(config: PriorConfig) -> Any:
+        return lambda given: repaint(video, given, fill.maps, fill.azimuth, config)
+
+    rivals = {CLEAN_UP: by(PriorConfig(seed=seed)), INVERSION: by(PriorConfig(method="inversion", seed=seed))}
+    return self_check(fill.points, fill.observed, fill, rivals, np.random.default_rng(seed), regions)

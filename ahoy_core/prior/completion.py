@@ -1,0 +1,125 @@
+"""What the prior is used for on one person: completing a picture, turning it round, cleaning coarse videos."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from pydantic import BaseModel, ConfigDict, Field
+from torch import Tensor
+
+from ahoy_core.body.packaged import PackagedBody
+from ahoy_core.conventions import Cameras
+from ahoy_core.prior.bodymaps import body_maps, camera_azimuth
+from ahoy_core.prior.conditioning import Context, held_tokens
+from ahoy_core.prior.corpus.prompts import NEUTRAL
+from ahoy_core.prior.inversion import InversionConfig, clean_up, hallucinate
+from ahoy_core.prior.video import VideoModel
+
+
+class PriorConfig(BaseModel):
+    """How the prior is asked.
+
+    Attributes:
+        method: "clean-up" reads the coarse latents as input; "inversion" goes through noise and back.
+        steps: of the clean-up; 1 is the posterior mean.
+        inversion: knobs of the other method.
+        hold: keep latents whose surface was well observed.
+        seed: of the noise.
+    """
+
+    model_config = ConfigDict(frozen=True)
+
+    method: Literal["clean-up", "inversion"] = "clean-up"
+    steps: int = Field(1, ge=1)
+    inversion: InversionConfig = InversionConfig()
+    hold: bool = True
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """T person images of one subject, as far as they are known.
+
+    Attributes:
+        frames: [T,3,H,W] in [0,1] over grey; a coarse guess where nothing is known.
+        mask: [T,1,H,W] alpha of the person, hidden parts included.
+        coverage: [T,1,H,W] in [0,1], 1 where `frames` shows what was observed.
+    """
+
+    frames: Tensor
+    mask: Tensor
+    coverage: Tensor
+
+    def __post_init__(self) -> None:
+        shape = (len(self.frames), 1, *self.frames.shape[2:])
+        if self.mask.shape != shape or self.coverage.shape != shape:
+            raise ValueError(
+                f"expected mask and coverage {shape} for these frames, got {tuple(self.mask.shape)} and "
+                f"{tuple(self.coverage.shape)}"
+            )
+
+
+def pose_context(
+    body: PackagedBody, vertices: Tensor, root_rotations: Tensor, cameras: Cameras
+) -> tuple[Tensor, Tensor]:
+    """Body maps [1,T,7,H/4,W/4] and azimuths [1,T] of posed bodies.
+
+    Args:
+        body: the packaged body.
+        vertices: [T,V,3] posed, world.
+        root_rotations: [T,3,3].
+        cameras: T cameras.
+    """
+    return body_maps(body, vertices, cameras)[None], camera_azimuth(cameras.viewmats, root_rotations)[None]
+
+
+@torch.no_grad()
+def repaint(
+    video: VideoModel,
+    pictures: Pictures,
+    body: Tensor,
+    azimuth: Tensor,
+    config: PriorConfig,
+    prompt: str = NEUTRAL,
+) -> Tensor:
+    """Replaces what was not observed by what the prior finds plausible.
+
+    Args:
+        video: the prior, with or without an identity adapter.
+        pictures: T frames; a coarse guess everywhere, and how much of it was observed.
+        body: [1,T,7,H/4,W/4] from `pose_context`.
+        azimuth: [1,T].
+        config: knobs.
+        prompt: of the way back (the subject's, where there is an adapter).
+
+    Returns:
+        [T,3,H,W] in [0,1], as the prior made them: observed pixels are not pasted back (see `composited`).
+    """
+    coarse = video.encode(pictures.frames.transpose(0, 1)[None])
+    coverage, mask = pictures.coverage[None, :, 0], pictures.mask[None, :, 0]
+    held = held_tokens(coverage, mask) if config.hold else torch.zeros_like(held_tokens(coverage, mask))
+    factor = pictures.frames.shape[-1] // coarse.shape[-1]
+    context = Context(
+        text=video.embed([prompt]),
+        known=coarse,
+        held=held,
+        body=body,
+        azimuth=azimuth,
+        coarse=coarse,
+        coverage=torch.nn.functional.avg_pool2d(torch.minimum(coverage, mask), factor),
+    )
+    generator = torch.Generator().manual_seed(config.seed)
+    if config.method == "clean-up":
+        noise = torch.randn(coarse.shape, generator=generator)
+        latents = clean_up(video, noise, context, config.steps).latents
+    else:
+        latents = hallucinate(video, coarse, context, video.embed([NEUTRAL]), config.inversion, generator).latents
+    return video.decode(latents)[0].transpose(0, 1)
+
+
+def composited(generated: Tensor, pictures: Pictures) -> Tensor:
+    """Generated pictures with what was observed pasted over them: a hallucination never overwrites evidence."""
+    share = torch.minimum(pictures.coverage, pictures.mask)
+    return generated * (1 - share) + pictures.frames * share

@@ -1,0 +1,249 @@
+"""Fine-tuning on one subject: low-rank updates and one learned word (paper, section 3.2, equation 2)."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import torch
+from pydantic import BaseModel, ConfigDict, Field
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+
+from ahoy_core.formats.atomic import atomic_path
+from ahoy_core.prior.conditioning import Context
+from ahoy_core.prior.text import IDENTITY_PROMPT, IDENTITY_TOKEN, embedding_weight, identity_token_id
+from ahoy_core.prior.video import VideoModel
+
+ADAPTER: Final = "identity"
+_TARGETS: Final = ["to_q", "to_k", "to_v", "to_out.0", "ffn.net.0.proj", "ffn.net.2"]
+_FILES: Final = ("pytorch_lora_weights.safetensors", "pytorch_lora_weights_2.safetensors")
+_TOKEN_FILE: Final = "learned_embeds.safetensors"
+_SEEN: Final = 0.5  # share of a latent's pixels that must be the visible person for it to count
+
+
+class IdentityConfig(BaseModel):
+    """Knobs of the fine-tuning.
+
+    Attributes:
+        rank: of the low-rank updates.
+        steps: of the optimizer.
+        batch: frames a step.
+        lr: of the low-rank updates.
+        token_lr: of the learned word.
+        seed: of the frames, noise and times drawn.
+    """
+
+    model_config = ConfigDict(frozen=True)
+
+    rank: int = Field(4, ge=1)
+    steps: int = Field(120, ge=1)
+    batch: int = Field(8, ge=1)
+    lr: float = Field(2e-3, gt=0)
+    token_lr: float = Field(1e-2, gt=0)
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Frames:
+    """An unordered set of person images of one subject.
+
+    Attributes:
+        images: [N,3,H,W] in [0,1] over grey.
+        visible: [N,1,H,W] in [0,1] the visible part of the subject; everything else is kept out of the loss.
+        body: [N,7,H/4,W/4] `body_maps` of the fitted body in the same framing, or None.
+        azimuth: [N] radians, with `body`.
+    """
+
+    images: Tensor
+    visible: Tensor
+    body: Tensor | None = None
+    azimuth: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        if self.images.ndim != 4 or self.visible.shape != (len(self.images), 1, *self.images.shape[2:]):
+            raise ValueError(
+                f"expected images [N,3,H,W] and visible [N,1,H,W], got {tuple(self.images.shape)} and "
+                f"{tuple(self.visible.shape)}"
+            )
+        if len(self.images) == 0 or not bool((self.visible > _SEEN).any()):
+            raise ValueError("expected at least one frame with a visible subject, got none; skip the identity stage")
+
+
+@dataclass(frozen=True)
+class IdentityCurve:
+    """The loss [steps] of a fine-tuning."""
+
+    losses: Tensor
+
+
+def experts(video: VideoModel) -> list[Any]:
+    """The transformers of a video model: one, or A14B's two."""
+    found = video.components.transformer, video.components.transformer_2
+    return [network for network in found if network is not None]
+
+
+def add_identity(video: VideoModel, rank: int, seed: int) -> None:
+    """Puts a fresh adapter (which changes nothing yet) on attention and feed-forward layers of every expert.
+
+    Raises:
+        ValueError: when there is one already.
+    """
+    from peft import LoraConfig
+
+    if has_identity(video):
+        raise ValueError("expected a prior without an identity adapter, got one; load the prior anew for each subject")
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        config = LoraConfig(r=rank, lora_alpha=rank, init_lora_weights="gaussian", target_modules=_TARGETS)
+        for network in experts(video):
+            network.requires_grad_(False)
+            network.add_adapter(config, adapter_name=ADAPTER)
+
+
+def has_identity(video: VideoModel) -> bool:
+    """Whether an adapter is there."""
+    return ADAPTER in getattr(video.components.transformer, "peft_config", {})
+
+
+@contextmanager
+def without_identity(video: VideoModel) -> Iterator[None]:
+    """The prior as it was before the fine-tuning, for as long as the block lasts."""
+    adapted = [network for network in experts(video) if ADAPTER in getattr(network, "peft_config", {})]
+    for network in adapted:
+        network.disable_adapters()
+    try:
+        yield
+    finally:
+        for network in adapted:
+            network.enable_adapters()
+
+
+def train_identity(video: VideoModel, frames: Frames, config: IdentityConfig) -> IdentityCurve:
+    """Fine-tunes the prior on a subject: E ||(z1 - z0) - v(z_tau, tau; "a [v] person")||^2 over visible latents.
+
+    Each frame is a video of one frame, so nothing of the order is learned. The adapter and the word stay in the model.
+
+    Args:
+        video: without an adapter.
+        frames: of the subject.
+        config: knobs.
+
+    Raises:
+        FloatingPointError: when the loss is not finite.
+    """
+    add_identity(video, config.rank, config.seed)
+    generator = torch.Generator().manual_seed(config.seed)
+    with torch.no_grad():
+        clean = video.encode(frames.images[:, :, None])
+    size = frames.images.shape[-1] // clean.shape[-1]
+    weight = (nn.functional.avg_pool2d(frames.visible, size) >= _SEEN).float()[:, :, None]
+    word = _learned_word(video)
+    updates = [p for network in experts(video) for p in network.parameters() if p.requires_grad]
+    groups = [{"params": updates, "lr": config.lr}, {"params": [word], "lr": config.token_lr}]
+    optimizer = torch.optim.AdamW(groups, betas=(0.9, 0.99), weight_decay=0.0)
+    losses = []
+    with _spoken(video, word):
+        for step in range(config.steps):
+            rows = torch.randint(len(clean), (config.batch,), generator=generator)
+            loss = _identity_loss(video, clean[rows], weight[rows], _context(video, frames, rows), generator)
+            if not bool(torch.isfinite(loss)):
+                raise FloatingPointError(f"expected a finite loss, got {float(loss.detach())} in step {step}; lower lr")
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+            losses.append(float(loss.detach()))
+    with torch.no_grad():
+        embedding_weight(video.components.text_encoder)[identity_token_id(video.components.tokenizer)] = word
+    for parameter in updates:
+        parameter.requires_grad_(False)
+    return IdentityCurve(torch.tensor(losses))
+
+
+def save_identity(video: VideoModel, folder: Path) -> None:
+    """Writes the adapter in diffusers' LoRA format (one file an expert) and the learned word.
+
+    Args:
+        video: after `train_identity`.
+        folder: exists.
+    """
+    from diffusers import WanPipeline
+    from peft.utils import get_peft_model_state_dict
+
+    for network, name in zip(experts(video), _FILES, strict=False):
+        metadata = network.peft_config[ADAPTER].to_dict()
+        WanPipeline.save_lora_weights(
+            folder,
+            transformer_lora_layers=get_peft_model_state_dict(network, adapter_name=ADAPTER),
+            weight_name=name,
+            transformer_lora_adapter_metadata=metadata,
+        )
+    word = embedding_weight(video.components.text_encoder)[identity_token_id(video.components.tokenizer)]
+    with atomic_path(folder / _TOKEN_FILE) as temporary:
+        save_file({IDENTITY_TOKEN: word.detach().clone()}, temporary)
+
+
+def load_identity(video: VideoModel, folder: Path) -> None:
+    """Puts a saved subject into a fresh prior.
+
+    Raises:
+        FileNotFoundError: when a file for one of the experts is missing.
+    """
+    for network, name in zip(experts(video), _FILES, strict=False):
+        if not (folder / name).is_file():
+            raise FileNotFoundError(f"expected {name} in {str(folder)!r}, got none; run the identity stage again")
+        network.load_lora_adapter(folder / name, prefix="transformer", adapter_name=ADAPTER, local_files_only=True)
+        network.requires_grad_(False)
+    word = load_file(folder / _TOKEN_FILE)[IDENTITY_TOKEN]
+    with torch.no_grad():
+        embedding_weight(video.components.text_encoder)[identity_token_id(video.components.tokenizer)] = word
+
+
+def _context(video: VideoModel, frames: Frames, rows: Tensor) -> Context:
+    text = video.embed([IDENTITY_PROMPT]).expand(len(rows), -1, -1)
+    if frames.body is None or frames.azimuth is None:
+        return Context(text)
+    return Context(text, body=frames.body[rows][:, None], azimuth=frames.azimuth[rows][:, None])
+
+
+def _identity_loss(
+    video: VideoModel, clean: Tensor, weight: Tensor, context: Context, generator: torch.Generator
+) -> Tensor:
+    """Equation 2 on a batch [B,C,1,h,w], averaged over visible latents."""
+    tau = torch.sigmoid(0.5 + 1.1 * torch.randn(len(clean), generator=generator))
+    noise = torch.randn(clean.shape, generator=generator)
+    level = tau.view(-1, 1, 1, 1, 1)
+    velocity = video.velocity((1 - level) * clean + level * noise, tau, context)
+    error = (velocity - (noise - clean)).square() * weight
+    return error.sum() / (clean.shape[1] * weight.sum()).clamp(min=1)
+
+
+def _learned_word(video: VideoModel) -> nn.Parameter:
+    table = embedding_weight(video.components.text_encoder)
+    start = table[identity_token_id(video.components.tokenizer)].detach().clone().float()
+    return nn.Parameter(start)
+
+
+@contextmanager
+def _spoken(video: VideoModel, word: nn.Parameter) -> Iterator[None]:
+    """Within the block the encoder reads the identity token as `word`, without a gradient for the whole table."""
+    number = identity_token_id(video.components.tokenizer)
+
+    def replaced(_: nn.Module, inputs: tuple[Tensor, ...], output: Tensor) -> Tensor:
+        return torch.where((inputs[0] == number)[..., None], word.to(output.dtype), output)
+
+    video.components.text_encoder.requires_grad_(False)
+    hook = video.components.text_encoder.encoder.embed_tokens.register_forward_hook(replaced)
+    try:
+        yield
+    finally:
+        hook.remove()
+
+
+def fresh(video: VideoModel) -> VideoModel:
+    """A deep copy, to fine-tune without touching the original."""
+    return copy.deepcopy(video)

@@ -1,0 +1,177 @@
+"""The generative prior: `python -m benchmarks.prior CAPTURES_DIR --corpus SHARDS --json OUT`.
+
+One JSON object. Held-out rendered people come from SHARDS (`ahoy prior corpus` makes them); captures from CAPTURES_DIR,
+whose subjects and clothes are in no split of the corpus. PSNRs are means over pictures in dB (peak 1), inside the named
+region alone; `gain` keys are differences in dB. `gradient` is gradient energy as a share of the truth's. Times are CPU
+seconds of this process on `threads` threads; `machine` says on what, and how busy it was.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ahoy_core.body.packaged import PackagedBody, load_packaged_body
+from ahoy_core.body.rotations import axis_angle_to_matrix
+from ahoy_core.conventions import Cameras
+from ahoy_core.cost import machine
+from ahoy_core.prior.canonical import CanonicalFill, check_prior
+from ahoy_core.prior.conditioning import Context
+from ahoy_core.prior.corpus.prompts import NEUTRAL
+from ahoy_core.prior.corpus.shards import shards
+from ahoy_core.prior.evaluate import held_out, load_clips, psnr, round_trips
+from ahoy_core.prior.identity import Frames, IdentityConfig, train_identity
+from ahoy_core.prior.inversion import clean_up
+from ahoy_core.prior.solvers import EVALUATIONS
+from ahoy_core.prior.subject import subject_frames
+from ahoy_core.prior.text import IDENTITY_PROMPT
+from ahoy_core.prior.video import VideoModel, load_video
+from ahoy_core.texture.atlas import ObservedAtlas
+from ahoy_core.texture.texture import TextureConfig, build_texture
+from benchmarks.captures import Capture, capture_folders, posed_vertices, read_capture, true_fit
+
+_BUDGETS = (16, 32)
+_REFERENCE_STEPS = 32  # of RK4: 128 evaluations
+_CAMERAS = ("front", "left", "back", "right")
+_BANDS = {"torso": (0.1, 0.6), "legs": (-0.85, -0.1)}  # of the body's height in [-1,1]
+_IDENTITY_FRAMES = 12
+
+
+def static_views(capture: Capture, body: PackagedBody) -> Frames:
+    """The four cameras of the first scored frame, whole, as person images."""
+    fit, number = true_fit(capture, body), capture.scored_frames()[0]
+    vertices = torch.from_numpy(posed_vertices(body, fit, number))[None].expand(4, -1, -1)
+    pictures = [torch.from_numpy(capture.truth(name, number)).permute(2, 0, 1).float() / 255 for name in _CAMERAS]
+    views = [capture.cameras[name] for name in _CAMERAS]
+    cameras = Cameras(
+        torch.cat([view.viewmats for view in views]),
+        torch.cat([view.Ks for view in views]),
+        views[0].width,
+        views[0].height,
+    )
+    root = axis_angle_to_matrix(torch.from_numpy(fit["pose"][number, 0])).expand(4, 3, 3)
+    rgba = torch.stack(pictures)
+    return subject_frames(rgba[:, :3], rgba[:, 3:], cameras, body, vertices, root)
+
+
+def video_frames(capture: Capture, body: PackagedBody) -> Frames:
+    """Frames of the occluded video, evenly spread, as person images."""
+    fit = true_fit(capture, body)
+    numbers = torch.linspace(0, len(capture.frames) - 1, _IDENTITY_FRAMES).round().int().tolist()
+    vertices = torch.stack([torch.from_numpy(posed_vertices(body, fit, n)) for n in numbers])
+    front = capture.cameras["front"]
+    count = len(numbers)
+    cameras = Cameras(front.viewmats.expand(count, 4, 4), front.Ks.expand(count, 3, 3), front.width, front.height)
+    root = axis_angle_to_matrix(torch.from_numpy(fit["pose"][numbers, 0]))
+    images = torch.from_numpy(capture.frames[numbers]).permute(0, 3, 1, 2).float() / 255
+    visible = torch.from_numpy(capture.visible[numbers])[:, None].float() / 255
+    return subject_frames(images, visible, cameras, body, vertices, root)
+
+
+def generated(video: VideoModel, views: Frames, prompt: str, front: bool) -> Tensor:
+    """Posterior mean of the four views [4,3,H,W], with the front held or with nothing but text and body."""
+    assert views.body is not None and views.azimuth is not None
+    with torch.no_grad():
+        known = video.encode(views.images.transpose(0, 1)[None])
+        held = torch.zeros(1, 4, known.shape[3] // 2, known.shape[4] // 2, dtype=torch.bool)
+        held[:, 0] = front
+        context = Context(video.embed([prompt]), known, held, views.body[None], views.azimuth[None])
+        noise = torch.randn(known.shape, generator=torch.Generator().manual_seed(0))
+        return video.decode(clean_up(video, noise, context, 1).latents)[0].transpose(0, 1)
+
+
+def band_weight(views: Frames, name: str) -> Tensor:
+    """[4,1,H,W] alpha of a band of the body's height."""
+    assert views.body is not None
+    height = views.body[:, 3] / views.body[:, 0].clamp(min=1e-3)
+    low, high = _BANDS[name]
+    inside = (height > low) & (height < high) & (views.body[:, 0] > 0.5)
+    fine = inside.repeat_interleave(4, -1).repeat_interleave(4, -2)[:, None].float()
+    return fine * views.visible
+
+
+def colours(pictures: Tensor, weight: Tensor) -> Tensor:
+    """Mean colour [3] under weights."""
+    return (pictures * weight).sum((0, 2, 3)) / weight.sum().clamp(min=1)
+
+
+def capture_figures(load: Callable[[], VideoModel], capture: Capture, body: PackagedBody) -> dict[str, Any]:
+    """Front to the other three cameras, and garment colours before and after the identity fine-tuning."""
+    video, views, frames = load(), static_views(capture, body), video_frames(capture, body)
+    turned = generated(video, views, NEUTRAL, front=True)
+    mirror = views.images[:1].flip(-1).expand_as(views.images)
+    flat = torch.full_like(views.images, 0.5)
+    for name in _BANDS:
+        weight = band_weight(views, name)
+        flat = torch.where(weight > 0, colours(views.images[:1], weight[:1])[:, None, None], flat)
+    found: dict[str, Any] = {
+        "self_check": self_checked(video, capture, body),
+        "static_from_front": {},
+        "identity": {},
+    }
+    for name in _BANDS:
+        weight = band_weight(views, name)[1:]
+        for label, made in (("prior", turned), ("mirror", mirror), ("colours", flat)):
+            found["static_from_front"][f"{label}/{name}"] = float(psnr(made[1:], views.images[1:], weight).nanmean())
+    before = generated(video, views, NEUTRAL, front=False)
+    start = time.process_time()
+    curve = train_identity(video, frames, IdentityConfig()).losses
+    found["identity"]["cpu_seconds"] = round(time.process_time() - start, 1)
+    found["identity"]["loss_first_last"] = [float(curve[:20].mean()), float(curve[-20:].mean())]
+    after = generated(video, views, IDENTITY_PROMPT, front=False)
+    for name in _BANDS:
+        weight = band_weight(views, name)
+        truth = colours(views.images, weight)
+        for label, made in (("before", before), ("after", after)):
+            found["identity"][f"colour_distance_{label}/{name}"] = float((colours(made, weight) - truth).norm())
+    return found
+
+
+def self_checked(video: VideoModel, capture: Capture, body: PackagedBody) -> dict[str, Any]:
+    """The self-check on a capture's texture, from the true body."""
+    fit = true_fit(capture, body)
+    texture = build_texture(capture.frames, capture.visible, fit, body, TextureConfig(atlas_size=256, frame_stride=4))
+    observed = ObservedAtlas(texture.observed_rgb, texture.coverage, texture.source_frame)
+    check = check_prior(video, CanonicalFill(body, fit["betas"], observed))
+    return {"errors": check.errors, "winner": check.winner, "regions": check.regions, "pixels": check.pixels}
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("captures", type=Path)
+    parser.add_argument("--prior", type=Path, required=True, help="folder of the prior")
+    parser.add_argument("--corpus", type=Path, help="folder with held-out shards")
+    parser.add_argument("--clips", type=int, default=24, help="held-out clips of each split")
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--json", type=Path, required=True)
+    arguments = parser.parse_args()
+    torch.set_num_threads(arguments.threads)
+    start = time.process_time()
+    video = load_video(arguments.prior)
+    found: dict[str, Any] = {
+        "machine": machine(),
+        "threads": arguments.threads,
+        "prior_load_cpu_seconds": round(time.process_time() - start, 2),
+    }
+    if arguments.corpus is not None:
+        found["held_out"] = held_out(video, arguments.corpus, arguments.clips)
+        some = load_clips(shards(arguments.corpus, "people")[0], 1).views([0, 2, 4, 6])
+        found["round_trip"] = round_trips(video, some, _BUDGETS, tuple(EVALUATIONS), _REFERENCE_STEPS)
+    body = load_packaged_body()
+    found["captures"] = {
+        folder.name: capture_figures(lambda: load_video(arguments.prior), read_capture(folder), body)
+        for folder in capture_folders(arguments.captures)
+    }
+    arguments.json.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
