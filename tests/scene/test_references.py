@@ -167,20 +167,30 @@ def test_motion_blur_is_that_of_many_moments():
     assert score > without + 6 and score > 34, (score, without)
 
 
+def test_a_lens_that_hardly_blurs_does_not_shift_the_picture():
+    (one,) = sampling.samples(1, moving=False, lens=True, shutter=0.0)
+    assert one.offset == (0.0, 0.0)
+    many = sampling.samples(16, moving=False, lens=True, shutter=0.0)
+    assert abs(sum(s.offset[0] for s in many)) < 1 and abs(sum(s.offset[1] for s in many)) < 1
+
+
 def test_depth_of_field_is_that_of_many_points_of_the_lens_and_leaves_the_focus_sharp():
     who = puppet()
-    shot = Shot(camera(), aperture=0.12)
+    shot = Shot(camera(), aperture=0.3)
     truth = pictures(128, shot, who, room(), ("depth_of_field",))
     sharp = pictures(None, shot, who, room(), ())
     found = pictures(None, shot, who, room(), ("depth_of_field",))
     score, without = float(psnr(found, truth)), float(psnr(sharp, truth))
-    assert score > without + 3 and score > 32, (score, without)
+    # Measured 58 against 41 dB; the reference with 200 points instead of 128 differs by 65 dB.
+    assert score > without + 10 and score > 50, (score, without)
     focus = sampling.focus_of(Content(room(), (who,), shot))
-    point = torch.tensor([[0.1, 0.0, 0.9]])
+    point, further = torch.tensor([[0.1, 0.0, 0.9]]), torch.tensor([0.0, 2.0, 0.0])
     cameras = camera((0.0, -focus, 0.9), (0.0, 0.0, 0.9))
     through = sampling.through_lens(cameras, (0.7, -0.7), 0.1, focus)
     assert torch.allclose(cameras.project(point).pixels, through.project(point).pixels, atol=1e-3)
-    assert not torch.allclose(cameras.project(point * 3).pixels, through.project(point * 3).pixels, atol=0.1)
+    assert not torch.allclose(
+        cameras.project(point + further).pixels, through.project(point + further).pixels, atol=0.1
+    )
 
 
 def test_view_dependent_colour_is_the_rasterizers_own():

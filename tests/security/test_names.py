@@ -48,7 +48,7 @@ def test_a_video_with_markup_in_its_name_gets_a_harmless_id(tmp_path: Path, clip
     path.write_bytes(clip)
     source = fetch_source(str(path), SourcePolicy(), tmp_path / "cache")
     request = VideoRequest(video=str(path), out=str(tmp_path / "out"), store="memory://security-names")
-    run = request.run(source, observer=None)  # type: ignore[arg-type]
+    run = request.run(request.id_of(source), observer=None)  # type: ignore[arg-type]
     assert re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", run.video_id)
 
 

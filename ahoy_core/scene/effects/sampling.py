@@ -2,7 +2,7 @@
 
 Both draw on the same samples, so that having both costs no more than the one that needs more of them. Samples are
 evenly spread (moments at the middles of equal intervals, points of the lens on a sunflower spiral), the same for every
-frame, so that nothing flickers. Reference: the same with many samples, tests/scene/test_sampling.py.
+frame, so that nothing flickers. Reference: the same with many samples, tests/scene/test_references.py.
 """
 
 from __future__ import annotations
@@ -41,7 +41,9 @@ def samples(count: int, moving: bool, lens: bool, shutter: float) -> list[Sample
         # Steps by the golden ratio visit the spiral's rings evenly in every part of the exposure.
         k = int((i * 0.6180339887 % 1) * count) if moving and lens else i
         radius = math.sqrt((k + 0.5) / count)
-        offset = (radius * math.cos(k * _GOLDEN), radius * math.sin(k * _GOLDEN)) if lens else (0.0, 0.0)
+        # A single one stands for the whole lens: any place but its middle would only shift the picture.
+        spread = lens and count > 1
+        offset = (radius * math.cos(k * _GOLDEN), radius * math.sin(k * _GOLDEN)) if spread else (0.0, 0.0)
         made.append(Sample(moment, offset))
     return made
 
