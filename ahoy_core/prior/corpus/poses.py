@@ -82,8 +82,7 @@ def pose_rotations(body: PackagedBody, angles: Angles) -> Tensor:
     "raise" and "hip" swing a limb forwards, "abduct" and "spread" away from the body (abduct 0: the arm hangs).
     """
     names = list(body.joint_names)
-    _, rest = body.shape(body.default_betas[None])
-    rest = rest[0].double().numpy()
+    rest: NDArray[Any] = body.shape(body.default_betas[None])[1][0].double().numpy()
     turns = np.tile(np.eye(3), (body.n_joints, 1, 1))
 
     def angle(name: str, default: float = 0.0) -> float:
@@ -116,8 +115,8 @@ def pose_rotations(body: PackagedBody, angles: Angles) -> Tensor:
         turns[at("lowerarm01")] = _turn(hinge, angle(f"elbow.{side}", 15) - bent)
         knuckles = rest[at("finger2-1")] - rest[at("finger5-1")]
         for finger in range(2, 6):
-            for joint in (1, 2, 3):
-                turns[at(f"finger{finger}-{joint}")] = _turn(knuckles, sign * angle(f"curl.{side}", 22))
+            for phalanx in (1, 2, 3):
+                turns[at(f"finger{finger}-{phalanx}")] = _turn(knuckles, sign * angle(f"curl.{side}", 22))
         turns[at("upperleg01")] = _turn(x, -angle(f"hip.{side}")) @ _turn(y, -sign * angle(f"spread.{side}"))
         turns[at("lowerleg01")] = _turn(x, angle(f"knee.{side}"))
     return torch.from_numpy(turns).float()
