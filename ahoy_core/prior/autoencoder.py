@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -79,9 +80,11 @@ class FrameAutoencoder(ModelMixin, ConfigMixin):
             nn.Conv2d(half, 12, 3, padding=1),
             nn.PixelShuffle(2),
         )
+        last: Any
         for last in (self.encoder[-1], self.decoder[-2]):
             nn.init.zeros_(last.weight)
-        nn.init.orthogonal_(self.encoder_skip[1].weight.flatten(1))
+        skip: Any = self.encoder_skip[1]
+        nn.init.orthogonal_(skip.weight.flatten(1))
 
     def encode(self, frames: Tensor) -> Tensor:
         """Frames [N,3,H,W] in [-1,1] -> latents [N,C,H/8,W/8], not normalized.

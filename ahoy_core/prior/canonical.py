@@ -58,7 +58,7 @@ class CanonicalFill:
     def __call__(self, kept: Tensor) -> Pictures:
         """The completed views if only the texels `kept` [N] had been observed."""
         size = len(self._atlas.coverage)
-        known = np.zeros(size * size, dtype=bool)
+        known: Array = np.zeros(size * size, dtype=bool)
         known[self._texels.flat[kept.numpy()]] = True
         known = known.reshape(size, size)
         atlas = ObservedAtlas(

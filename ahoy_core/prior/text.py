@@ -28,7 +28,7 @@ _WORDS = (
 
 def build_tokenizer() -> Any:
     """A unigram tokenizer: the words of captions, some neighbours, and single letters for everything else."""
-    from transformers import T5TokenizerFast  # type: ignore[attr-defined]
+    from transformers import T5TokenizerFast
 
     words = dict.fromkeys([*NEUTRAL.split(), *COLOURS, *WEARABLES.values(), *_WORDS])
     pieces = [("<pad>", 0.0), ("</s>", 0.0), ("<unk>", 0.0), ("▁", -2.0)]

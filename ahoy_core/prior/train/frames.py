@@ -121,7 +121,8 @@ def start_from_principal_components(model: FrameAutoencoder, frames: Tensor, mas
     deviations, basis = torch.linalg.svd(patches - mean, full_matrices=False)[1:]
     count = model.config.latent_channels
     deviations, basis = deviations[:count, None] / len(patches) ** 0.5, basis[:count]
-    encode, decode = model.encoder_skip[1], model.decoder_skip[0]
+    encode: Any = model.encoder_skip[1]
+    decode: Any = model.decoder_skip[0]
     encode.weight.copy_((basis / deviations)[..., None, None])
     encode.bias.copy_(-(basis / deviations) @ mean)
     decode.weight.copy_((basis * deviations).T[..., None, None])
