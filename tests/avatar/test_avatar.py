@@ -70,7 +70,7 @@ def test_damaged_files_are_refused_by_name(tmp_path: Path):
         load_avatar(tmp_path)
     tensors.write_bytes(whole)
     description.write_text(json.dumps({**json.loads(description.read_text()), "format": 99}))
-    with pytest.raises(ValueError, match="expected avatar format 1, got 99"):
+    with pytest.raises(ValueError, match="expected avatar format 2 or older, got 99"):
         load_avatar(tmp_path)
 
 
