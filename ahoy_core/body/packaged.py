@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from importlib import resources
 from typing import Any
@@ -14,9 +14,10 @@ import torch
 from safetensors.numpy import load
 from torch import Tensor
 
-from ahoy_core.body.lbs import forward_kinematics, lbs, normalize_weights
+from ahoy_core.body.lbs import normalize_weights
 from ahoy_core.body.model import BodyOutput
 from ahoy_core.body.phenotype import BETA_NAMES, corner_weights
+from ahoy_core.body.posing import check_pose, check_shapes, moved_to, pose_rest
 from ahoy_core.body.regions import vertex_regions
 from ahoy_core.body.rotations import axis_angle_to_matrix
 
@@ -120,13 +121,7 @@ class PackagedBody:
             rest_joints: [B,J,3] or [1,J,3].
             transl: [B,3] metres.
         """
-        batch = len(rotations)
-        transforms = forward_kinematics(rotations, rest_joints, self.parents, transl)
-        rest_vertices = rest_vertices.expand(batch, -1, -1)
-        rest_joints = rest_joints.expand(batch, -1, -1)
-        joints = (transforms[..., :3, :3] @ rest_joints[..., None])[..., 0] + transforms[..., :3, 3]
-        vertices = lbs(rest_vertices, self.lbs_weights, transforms)
-        return BodyOutput(vertices, joints, transforms, rest_vertices, rest_joints)
+        return pose_rest(rotations, rest_vertices, rest_joints, self.lbs_weights, self.parents, transl)
 
     def __call__(self, pose: Tensor, betas: Tensor, transl: Tensor, expression: Tensor | None = None) -> BodyOutput:
         """Poses the body; see `BodyModel`.
@@ -134,29 +129,14 @@ class PackagedBody:
         Raises:
             ValueError: when a size does not fit this body.
         """
-        if pose.ndim != 3 or pose.shape[1:] != (self.n_joints, 3):
-            raise ValueError(
-                f"expected pose [B,{self.n_joints},3] axis-angle for body {self.name!r}, got {tuple(pose.shape)}; "
-                "poses of another body go through convert_pose"
-            )
-        if transl.shape != (len(pose), 3):
-            raise ValueError(f"expected transl [{len(pose)},3] to match pose, got {tuple(transl.shape)}")
+        check_pose(self, pose, transl)
         vertices, joints = self.shape(betas, expression)
-        if len(vertices) not in (1, len(pose)):
-            raise ValueError(f"expected one shape or {len(pose)} (one a pose), got {len(vertices)}")
+        check_shapes(pose, vertices)
         return self.pose_rest(axis_angle_to_matrix(pose), vertices, joints, transl)
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> PackagedBody:
         """The same body on another device or in another precision (load float64 anew for full precision)."""
-
-        def move(value: Any) -> Any:
-            if isinstance(value, Mapping):
-                return {key: move(item) for key, item in value.items()}
-            if not isinstance(value, Tensor):
-                return value
-            return value.to(device=device, dtype=dtype if value.is_floating_point() else None)
-
-        return replace(self, **{field.name: move(getattr(self, field.name)) for field in fields(self)})
+        return moved_to(self, device, dtype)
 
     def subset(self, indices: Tensor) -> PackagedBody:
         """The same body with some of its vertices only: cheap to pose, for fits.

@@ -6,14 +6,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
-from typing import Any, Final, Literal
+from dataclasses import dataclass, replace
+from typing import Final, Literal
 
 import torch
 from torch import Tensor
 
-from ahoy_core.body.lbs import forward_kinematics, lbs
 from ahoy_core.body.model import BodyOutput
+from ahoy_core.body.posing import check_pose, check_shapes, moved_to, pose_rest
 from ahoy_core.body.rotations import axis_angle_to_matrix
 
 HAND_JOINTS: Final = 15
@@ -128,23 +128,13 @@ class SmplBody:
         Raises:
             ValueError: when a size does not fit this body.
         """
-        if pose.ndim != 3 or pose.shape[1:] != (self.n_joints, 3):
-            raise ValueError(
-                f"expected pose [B,{self.n_joints},3] axis-angle for body {self.name!r}, got {tuple(pose.shape)}; "
-                "poses of another body go through convert_pose"
-            )
-        if transl.shape != (len(pose), 3):
-            raise ValueError(f"expected transl [{len(pose)},3] to match pose, got {tuple(transl.shape)}")
+        check_pose(self, pose, transl)
         vertices, rest_joints = self.shape(betas, expression)
-        if len(vertices) not in (1, len(pose)):
-            raise ValueError(f"expected one shape or {len(pose)} (one a pose), got {len(vertices)}")
+        check_shapes(pose, vertices)
         rotations = axis_angle_to_matrix(pose)
         departure = rotations[:, 1:] - torch.eye(3, dtype=pose.dtype, device=pose.device)
         vertices = vertices + (departure.flatten(1) @ self.pose_basis.flatten(1)).unflatten(1, (-1, 3))
-        transforms = forward_kinematics(rotations, rest_joints, self.parents, transl)
-        rest_joints = rest_joints.expand(len(pose), -1, -1)
-        joints = (transforms[..., :3, :3] @ rest_joints[..., None])[..., 0] + transforms[..., :3, 3]
-        return BodyOutput(lbs(vertices, self.lbs_weights, transforms), joints, transforms, vertices, rest_joints)
+        return pose_rest(rotations, vertices, rest_joints, self.lbs_weights, self.parents, transl)
 
     def hand_pose(self, components: Tensor, side: Literal["left", "right"]) -> Tensor:
         """A hand's pose [B,15,3] axis-angle from PCA coefficients, the mean hand included.
@@ -166,15 +156,7 @@ class SmplBody:
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> SmplBody:
         """The same body on another device or in another precision."""
-        return self._map(lambda value: value.to(device=device, dtype=dtype if value.is_floating_point() else None))
-
-    def _map(self, move: Any) -> SmplBody:
-        def apply(value: Any) -> Any:
-            if isinstance(value, Mapping):
-                return {key: apply(item) for key, item in value.items()}
-            return move(value) if isinstance(value, Tensor) else value
-
-        return replace(self, **{field.name: apply(getattr(self, field.name)) for field in fields(self)})
+        return moved_to(self, device, dtype)
 
     def subset(self, indices: Tensor) -> SmplBody:
         """The same body with some of its vertices only: cheap to pose, for fits.
