@@ -19,7 +19,6 @@ from ahoy_core.body.packaged import PackagedBody, load_packaged_body
 from ahoy_core.export import facts
 from ahoy_core.formats.npz import load_npz
 from ahoy_core.motion import BUILT_IN, Motion, load_motion
-from ahoy_core.scene.effects.expression import with_expression
 from ahoy_core.view.explain import MODES, explained_colors, nearest_hit, source_frame
 
 _SHOWN_ACTIONS = ("jawOpen", "mouthSmileLeft", "mouthSmileRight", "eyeBlinkLeft", "eyeBlinkRight", "browInnerUp")
@@ -128,10 +127,8 @@ class Viewer:
         """What is shown now."""
         motion = self.motion()
         frame = self.frame % len(motion)
-        face = self.avatar
-        if bool(self.expression.any()):
-            face = with_expression(face, self.body, self.expression)
-        return face.pose(self.body, motion.pose[frame], motion.transl[frame])
+        face = self.expression if bool(self.expression.any()) else None
+        return self.avatar.pose(self.body, motion.pose[frame], motion.transl[frame], expression=face)
 
     def refresh(self) -> None:
         """Send the present state to the browsers."""

@@ -147,6 +147,7 @@ class Avatar:
         transl: Tensor | None = None,
         expression: Tensor | None = None,
         pose_strength: float | None = None,
+        face: Tensor | None = None,
     ) -> Posed:
         """Pose the avatar.
 
@@ -157,6 +158,7 @@ class Avatar:
             expression: [E] face actions, 0 neutral, 1 the full action; neutral by default.
             pose_strength: How far a full avatar's map pose is pulled to the training poses, [0,1]; as stored by
                 default. The skeleton always follows `pose`.
+            face: [N,3] what `face_offset` gives, in place of an expression.
 
         Raises:
             ValueError: If the body is another one, or the pose or expression has another shape or is not finite.
@@ -172,7 +174,9 @@ class Avatar:
         ready = self._ready(kinematics, rotations, pose_strength)
         means = ready.canonical.means
         if expression is not None:
-            means = means + self._expressed(body, expression)
+            face = self.face_offset(body, expression)
+        if face is not None:
+            means = means + face
         means, covars = deform(means, ready.covars, ready.lbs_weights, relative)
         return Posed(means, covars, ready.canonical.colors, ready.canonical.opacities)
 
@@ -201,8 +205,12 @@ class Avatar:
         self._found["ready"] = ready
         return ready
 
-    def _expressed(self, body: BodyModel, expression: Tensor) -> Tensor:
-        """Canonical displacements [N,3] of face actions [E]."""
+    def face_offset(self, body: BodyModel, expression: Tensor) -> Tensor:
+        """Canonical displacements [N,3], metres, of face actions [E]; what all actions do is found once.
+
+        Raises:
+            ValueError: If they are not as many as the body has, or not finite.
+        """
         if tuple(expression.shape) != (body.n_expressions,) or not bool(torch.isfinite(expression).all()):
             raise ValueError(f"expected {body.n_expressions} finite face actions, got {tuple(expression.shape)}")
         if "expressions" not in self._found:

@@ -63,16 +63,12 @@ def expression_basis(body: BodyModel, betas: Tensor, template: Template) -> Tens
     Linear in the actions, as the bodies' expressions are; zero away from the head. FLAME's expressions come the same
     way, through the body that holds them.
     """
-    pose = shared_canonical_pose(body).to(betas)[None]
-    corners = body.faces[template.faces]
-    rows = [torch.zeros(len(template), 3)]
-    neutral = body(pose, betas[None], betas.new_zeros(1, 3)).vertices[0]
-    for number in range(body.n_expressions):
-        action = torch.zeros(1, body.n_expressions)
-        action[0, number] = 1.0
-        moved = body(pose, betas[None], betas.new_zeros(1, 3), action).vertices[0] - neutral
-        rows.append((moved[corners] * template.barycentric[:, :, None]).sum(1) * template.head[:, None])
-    return torch.stack(rows[1:]) if body.n_expressions else torch.zeros(0, len(template), 3)
+    count = body.n_expressions
+    pose, nothing = shared_canonical_pose(body).to(betas).expand(count + 1, -1, -1), betas.new_zeros(count + 1, 3)
+    actions = torch.cat([betas.new_zeros(1, count), torch.eye(count).to(betas)])
+    vertices = body(pose, betas[None], nothing, actions).vertices
+    moved = (vertices[1:] - vertices[0])[:, body.faces[template.faces]]
+    return (moved * template.barycentric[:, :, None]).sum(2) * template.head[:, None]
 
 
 @torch.no_grad()

@@ -13,9 +13,8 @@ import torch
 from torch import Tensor
 
 from ahoy_core.avatar.avatar import Avatar
-from ahoy_core.body.canonical import canonical_pose
-from ahoy_core.body.convert import body_skeleton
-from ahoy_core.body.lbs import blend_transforms, forward_kinematics
+from ahoy_core.avatar.kinematics import Kinematics
+from ahoy_core.body.lbs import blend_transforms
 from ahoy_core.body.model import BodyModel
 from ahoy_core.body.rotations import axis_angle_to_matrix
 from ahoy_core.motion.motion import Motion
@@ -62,21 +61,18 @@ class Puppet:
     motion: Motion
 
     @cached_property
-    def rest(self) -> Tensor:
-        """[J,3] joints at rest, of this avatar's shape."""
-        return body_skeleton(self.body, self.avatar.betas).rest_joints.float()
+    def kinematics(self) -> Kinematics:
+        """The skeleton, of this avatar's shape."""
+        return Kinematics.of(self.body, self.avatar.betas)
 
-    @cached_property
-    def _from_canonical(self) -> Tensor:
-        """[J,4,4] inverse of the canonical pose's transforms."""
-        rotations = axis_angle_to_matrix(canonical_pose(self.body).float())[None]
-        start = forward_kinematics(rotations, self.rest[None], self.body.parents, torch.zeros(1, 3))[0]
-        return torch.linalg.inv(start)
+    @property
+    def rest(self) -> Tensor:
+        """[J,3] joints at rest."""
+        return self.kinematics.rest_joints[0]
 
     def relative(self, pose: Tensor, transl: Tensor) -> Tensor:
         """[T,J,4,4]: what takes the canonical body to each of T poses [T,J,3] with translations [T,3]."""
-        rotations = axis_angle_to_matrix(pose)
-        return forward_kinematics(rotations, self.rest[None], self.body.parents, transl) @ self._from_canonical
+        return self.kinematics.relative(axis_angle_to_matrix(pose), transl)
 
     @cached_property
     def points(self) -> Points:

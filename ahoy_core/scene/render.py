@@ -22,7 +22,7 @@ from ahoy_core.formats.images import to_uint8
 from ahoy_core.motion.time import slerp
 from ahoy_core.scene.color import to_linear, to_srgb
 from ahoy_core.scene.cost import Ledger, rasterize
-from ahoy_core.scene.effects import contact_shadow, expression, foot_contact, light, sampling, view_color
+from ahoy_core.scene.effects import contact_shadow, foot_contact, light, sampling, view_color
 from ahoy_core.scene.plan import BASE, Plan
 from ahoy_core.scene.puppet import Points, Puppet
 from ahoy_core.scene.scene import Scene
@@ -115,12 +115,12 @@ class Stage:
         pose, transl = motion.pose[frame], motion.transl[frame]
         if moment > 0 and len(motion) > 1:
             pose, transl = _between(puppet, frame, moment)
-        avatar = puppet.avatar
+        face = None
         if self.plan.on("expression") and motion.expression is not None:
             with ledger.section("expression"):
-                avatar = expression.with_expression(avatar, puppet.body, motion.expression[frame])
+                face = puppet.avatar.face_offset(puppet.body, motion.expression[frame])
         with ledger.section(BASE):
-            posed = avatar.pose(puppet.body, pose, transl)
+            posed = puppet.avatar.pose(puppet.body, pose, transl, face=face)
         relative = None
         if self.plan.on("light") or self.plan.on("contact_shadow"):
             with ledger.section("light" if self.plan.on("light") else "contact_shadow"):

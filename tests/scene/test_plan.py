@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from ahoy_core.avatar import Avatar
 from ahoy_core.conventions import Cameras
 from ahoy_core.motion import Motion
 from ahoy_core.scene.cost import Rates
@@ -18,7 +20,7 @@ from ahoy_core.scene.puppet import Puppet
 from ahoy_core.scene.render import Stage
 from ahoy_core.scene.scene import Scene, empty_scene, make_scene
 from ahoy_core.scene.shot import Shot
-from tests.scene.things import camera, flat, floor, moved, puppet, room, smiling, wall
+from tests.scene.things import avatar, camera, flat, floor, full_avatar, moved, puppet, room, smiling, wall
 
 NEAR = camera((0.0, -1.2, 1.6), (0.0, 0.0, 1.5))
 FAR = camera((0.0, -40.0, 1.5), (0.0, 0.0, 1.0))
@@ -249,3 +251,15 @@ def test_a_one_frame_motion_of_one_pose_needs_no_blur_and_keeps_its_expression()
     assert isinstance(motion, Motion)
     plan = plan_effects(empty_scene(), [puppet(motion)], Shot(NEAR))
     assert plan.on("expression") and not plan.on("motion_blur")
+
+
+@pytest.mark.parametrize("who", [avatar, full_avatar])
+def test_the_expression_of_a_motion_is_seen_on_coarse_and_full_avatars(who: Callable[[], Avatar]):
+    acting = replace(puppet(smiling()), avatar=who())
+    shot = Shot(NEAR, shutter=0.0)
+    plan = plan_effects(empty_scene(), [acting], shot)
+    still = plan_effects(empty_scene(), [acting], shot, Request(()))
+    assert plan.on("expression") and not still.on("expression")
+    moved = Stage(empty_scene(), (acting,), shot, plan).picture(0).astype(int)
+    change = np.abs(moved - Stage(empty_scene(), (acting,), shot, still).picture(0).astype(int)).max(-1)
+    assert (change > 10).sum() > 5

@@ -11,10 +11,15 @@ import torch
 from torch import Tensor
 
 from ahoy_core.avatar import Avatar, AvatarInfo
-from ahoy_core.avatar.avatar import bake, network_config
+from ahoy_core.avatar.avatar import bake, bake_full, network_config
 from ahoy_core.avatar.deform import OffsetBounds, offset_channels
+from ahoy_core.avatar.full_model import full_network_config
+from ahoy_core.avatar.kinematics import Kinematics
+from ahoy_core.avatar.pose_maps import PoseMaps
+from ahoy_core.avatar.posing import PoseDependence
 from ahoy_core.body.canonical import canonical_pose
 from ahoy_core.body.packaged import PackagedBody, load_packaged_body
+from ahoy_core.body.rotations import axis_angle_to_matrix
 from ahoy_core.conventions import Cameras, look_at, perspective_K
 from ahoy_core.maps import StyleUNet
 from ahoy_core.motion import Motion, load_motion, placed
@@ -100,3 +105,15 @@ def smiling(frames: int = 4, amount: float = 1.0) -> Motion:
     expression = torch.zeros(frames, body().n_expressions)
     expression[:, body().expression_names.index("jawOpen")] = amount
     return replace(still, expression=expression)
+
+
+def full_avatar() -> Avatar:
+    """A pose-dependent avatar that was never trained: its Gaussians come from the map of each pose."""
+    start = dressed(64)
+    maps = PoseMaps(start, Kinematics.of(body(), body().default_betas), 2)
+    network = StyleUNet(full_network_config(maps, 4), torch.Generator().manual_seed(0))
+    base = torch.zeros(len(start), offset_channels(start))
+    posing = PoseDependence(base, axis_angle_to_matrix(canonical_pose(body()))[None], 2, 4, 1.0)
+    info = AvatarInfo(body=body().name, provenance={"source": "a test"})
+    poses = canonical_pose(body())[None]
+    return bake_full(maps, network, OffsetBounds(), posing, body().default_betas, poses, info)

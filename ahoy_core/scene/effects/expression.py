@@ -1,16 +1,9 @@
-"""Expression: the face of a motion, carried to the Gaussians of the head."""
+"""Expression: the face of a motion; `Avatar.face_offset` carries it to the Gaussians of the head."""
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import torch
-from torch import Tensor
 
-from ahoy_core.avatar.avatar import Avatar
-from ahoy_core.body.canonical import canonical_pose
-from ahoy_core.body.lbs import blend_transforms
-from ahoy_core.body.model import BodyModel
 from ahoy_core.scene.cost import Rates
 from ahoy_core.scene.effects.effect import Effect, Verdict
 from ahoy_core.scene.puppet import Puppet
@@ -21,34 +14,6 @@ LEAST_PIXELS = 20
 _LEAST_ACTION = 0.02
 # Cosine between where the face looks and where the camera is, beyond which only the back of the head is seen.
 _LEAST_FACING = -0.2
-
-
-def with_expression(avatar: Avatar, body: BodyModel, expression: Tensor) -> Avatar:
-    """The avatar with its face in an expression.
-
-    Each Gaussian follows the point of the body's surface that it was made from.
-
-    Args:
-        avatar: In a neutral expression.
-        body: Its body model.
-        expression: [E].
-
-    Raises:
-        ValueError: If the number of actions is not the body's.
-    """
-    if expression.shape != (body.n_expressions,):
-        raise ValueError(f"expected {body.n_expressions} actions of {body.name!r}, got {tuple(expression.shape)}")
-    pose, betas = canonical_pose(body).to(avatar.means)[None], avatar.betas[None]
-    nothing = pose.new_zeros(1, 3)
-    plain = body(pose, betas, nothing)
-    moved = body(pose, betas, nothing, expression.to(pose)[None])
-    # In rest space, then carried by the canonical pose's own skinning.
-    shift = moved.rest_vertices[0] - plain.rest_vertices[0]
-    linear = blend_transforms(body.lbs_weights, plain.transforms)[0, :, :3, :3]
-    shift = (linear @ shift[:, :, None])[:, :, 0]
-    corners = shift[body.faces[avatar.template.faces]]
-    offset = (avatar.template.barycentric.to(shift)[:, :, None] * corners).sum(1)
-    return replace(avatar, means=avatar.means + offset)
 
 
 def head_pixels(content: Content, puppet: Puppet, number: int) -> tuple[float, float]:
@@ -91,7 +56,7 @@ def _has_action(puppet: Puppet) -> bool:
 
 
 def _seconds(content: Content, verdict: Verdict, rates: Rates) -> float:
-    return content.frames * rates.face * sum(_has_action(p) for p in content.puppets)
+    return rates.face * sum(_has_action(p) for p in content.puppets)
 
 
 EXPRESSION = Effect(
