@@ -5,11 +5,11 @@ from __future__ import annotations
 import os
 import socket
 import time
-import traceback
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Any
 
+from tasks.errors import message_of
 from tasks.stage import Run
 
 SEQUENCE_STEP = 1000  # rows that one process may write: a retry of the same run goes on behind them
@@ -42,7 +42,7 @@ class AttemptRows:
             stage: where.
             error: what was raised.
         """
-        message = "".join(traceback.format_exception_only(error)).strip()[:2000] if error else None
+        message = message_of(error) if error else None
         self._append(state, stage=stage, error_class=type(error).__name__ if error else None, error_message=message)
 
     def _append(self, state: str, **more: Any) -> None:

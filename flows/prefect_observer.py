@@ -63,8 +63,7 @@ class PrefectObserver:
 
     def showed(self, stage: str, picture: Path) -> None:
         """Publish a picture of a stage at work; a later one takes its place on the page."""
-        text = f"![{picture.name}](data:image/jpeg;base64,{_thumbnail(picture)})"
-        create_markdown_artifact(text, key=f"picture-{stage}", description=f"{stage} at work")
+        create_markdown_artifact(_inline(picture), key=f"picture-{stage}", description=f"{stage} at work")
 
     def finished(self, ref: StageRef, folder: Path) -> None:
         """Publish the stage's bill and its pictures."""

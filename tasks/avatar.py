@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,8 +9,6 @@ from typing import Any
 
 import numpy as np
 import platformdirs
-import pyarrow as pa
-import pyarrow.parquet as pq
 import torch
 
 from ahoy_core.avatar.avatar import Avatar, AvatarInfo
@@ -26,9 +23,9 @@ from ahoy_core.avatar.supervision import CoarseInputs
 from ahoy_core.body.canonical import canonical_pose
 from ahoy_core.formats.images import contact_sheet, to_uint8, write_png
 from ahoy_core.formats.npz import load_npz
-from tasks.coarse import compare, load_inputs, plot_losses
 from tasks.roles import ours, packaged_body, perceptual_network, perceptual_role
 from tasks.stage import Role, Stage, StageContext, StageOutput
+from tasks.training import compare, draw_training, held_out_rows, load_inputs, training_summary
 
 PREVIEWS_SHOWN = 4
 COARSE_MAP_POSES = 3  # of coarse renders: the canonical pose and two of the video's that are far from it
@@ -55,8 +52,12 @@ def run_avatar(config: FullConfig, ctx: StageContext) -> StageOutput:
     )
     save_avatar(result.avatar, ctx.out)
     checkpoint.unlink(missing_ok=True)
-    _draw(result, observed, ctx.out)
-    return StageOutput(_summary(result, notes), ("compare.png", "training.png", "losses.png"), metrics=_metrics(result))
+    draw_training(result, TERMS, observed, ctx.out)
+    return StageOutput(
+        _summary(result, notes),
+        ("compare.png", "training.png", "losses.png"),
+        metrics=held_out_rows(result.held_out, "full"),
+    )
 
 
 def checkpoint_path(config: FullConfig, ctx: StageContext) -> Path:
@@ -114,31 +115,10 @@ def _show(previews: list[tuple[int, np.ndarray]], step: int, picture: torch.Tens
     ctx.show(ctx.out / "training.png")
 
 
-def _draw(result: FullResult, observed: CoarseInputs, out: Path) -> None:
-    pq.write_table(pa.Table.from_pylist([dataclasses.asdict(row) for row in result.losses]), out / "losses.parquet")
-    plot_losses(result.losses, TERMS, out / "losses.png")
-    compare(observed, result.avatar, out / "compare.png")
-
-
 def _summary(result: FullResult, notes: list[str]) -> dict[str, Any]:
-    share = result.avatar.observed_share
-    facts: dict[str, Any] = {"gaussians": len(result.avatar), "steps": len(result.losses)}
-    if (score := result.held_out) is not None:
-        facts["held-out frame, PSNR"] = f"{score.psnr_after:.2f} dB ({score.psnr_before:.2f} for the coarse avatar)"
-        facts["held-out frame, SSIM"] = f"{score.ssim_after:.3f} ({score.ssim_before:.3f} for the coarse avatar)"
-        facts["protocol"] = score.protocol
-    for name, value in result.corrections.items():
-        facts[f"largest {name} correction"] = f"{value:.0%} of its bound"
-    invented = f"{share:.0%} of the surface was observed in the video, {1 - share:.0%} was invented."
-    return {"facts": facts, "notes": [*notes, *result.notes], "invented": invented, "observed_share": share}
-
-
-def _metrics(result: FullResult) -> list[dict[str, Any]]:
-    score = result.held_out
-    if score is None:
-        return []
-    same = {"protocol": "input-view", "protocol_id": score.protocol, "region": "mask box", "camera": "observed"}
-    return [{**same, "frame": score.frame, "config": "full", "psnr": score.psnr_after, "ssim": score.ssim_after}]
+    summary = training_summary(result, "for the coarse avatar")
+    reached = {f"largest {name} correction": f"{v:.0%} of its bound" for name, v in result.corrections.items()}
+    return {**summary, "facts": {**summary["facts"], **reached}, "notes": [*notes, *summary["notes"]]}
 
 
 def _roles(config: FullConfig) -> Mapping[str, Role]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import errno
 import socket
+import traceback
 from collections.abc import Iterator
 
 from pydantic import ValidationError
@@ -71,6 +72,7 @@ _TRANSIENT_ERRNOS = frozenset(
         errno.ETIMEDOUT,
     }
 )
+_MAX_MESSAGE = 2000  # characters
 _TRANSIENT_LOOKUPS = frozenset({socket.EAI_AGAIN, socket.EAI_FAIL})
 
 # Classes of optional packages, by name, so that judging an error imports none of them.
@@ -112,6 +114,11 @@ def is_transient(error: BaseException | None) -> bool:
         if _says_transient(link):
             return True
     return False
+
+
+def message_of(error: BaseException) -> str:
+    """The error's class and text in one short piece, for tables and logs."""
+    return "".join(traceback.format_exception_only(error)).strip()[:_MAX_MESSAGE]
 
 
 def _says_transient(error: BaseException) -> bool:

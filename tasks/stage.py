@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
@@ -24,6 +23,7 @@ from ahoy_core.cost.meter import Bill, Meter
 from storage_schema.keys import stage_key
 from storage_schema.store import ArtifactStore, Manifest
 from storage_schema.tables import Tables
+from tasks.errors import message_of
 from tasks.role import Role as Role
 from tasks.roles import body_role
 
@@ -251,7 +251,7 @@ def _make(
     except BaseException as error:
         row = _row(run, stage, config, key, "failed", started, meter.read()) | {
             "error_class": type(error).__name__,
-            "error_message": _message(error),
+            "error_message": message_of(error),
         }
         run.tables.append("stages", [row], batch=run.batch)
         raise
@@ -307,7 +307,3 @@ def _row(
         "attempt_number": run.attempt_number,
         "seq": next(run.sequence),
     }
-
-
-def _message(error: BaseException) -> str:
-    return "".join(traceback.format_exception_only(error)).strip()[:2000]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
 
@@ -13,6 +13,7 @@ from torch import Tensor
 from ahoy_core.avatar.avatar import Avatar, AvatarInfo, bake, network_config
 from ahoy_core.avatar.config import CoarseConfig
 from ahoy_core.avatar.deform import Canonical, apply_offsets, deform, dense_weights, offset_channels
+from ahoy_core.avatar.held_out import HeldOut, Progress
 from ahoy_core.avatar.losses import Neighbourhood, masked_l1, photometric, regularisers
 from ahoy_core.avatar.render import Rendered, render
 from ahoy_core.avatar.supervision import CanonicalViews, CoarseInputs, Frame, canonical_views, observed_frames
@@ -21,9 +22,6 @@ from ahoy_core.maps.template import Template, build_template
 from ahoy_core.metrics import INPUT_VIEW, input_view_pair, psnr, ssim
 from ahoy_core.metrics.perceptual import Perceptual, patch_distance
 from ahoy_core.texture.texels import sample_atlas
-
-Progress = Callable[[int, int, float], None]
-"""Called with (step, steps, loss) after every step."""
 
 _NAN = float("nan")
 # A frame is held out only where at least this many are left to learn from.
@@ -41,18 +39,6 @@ class LossRow:
     regularisers: float
     perceptual: float
     held_out_psnr: float
-
-
-@dataclass(frozen=True)
-class HeldOut:
-    """Score of the frame that training never saw, under `protocol`; before is the textured template."""
-
-    frame: int
-    protocol: str
-    psnr_before: float
-    psnr_after: float
-    ssim_before: float
-    ssim_after: float
 
 
 @dataclass(frozen=True)

@@ -13,26 +13,13 @@ from ahoy_core.avatar.avatar import Avatar, AvatarInfo
 from ahoy_core.avatar.checkpoint import load_checkpoint, save_checkpoint
 from ahoy_core.avatar.full_config import FullConfig
 from ahoy_core.avatar.full_inputs import FullInputs, Plan, make_plan
+from ahoy_core.avatar.held_out import HeldOut, Progress
 from ahoy_core.avatar.trainer import FullRow, Trainer
 from ahoy_core.metrics import INPUT_VIEW
 from ahoy_core.metrics.perceptual import Perceptual
 
-FullProgress = Callable[[int, int, float], None]
-"""Called with (step, steps, loss) after every step."""
 Preview = Callable[[int, Tensor], None]
 """Called at every check with the step and a picture [3,H,W] in [0,1]: targets above, renders below."""
-
-
-@dataclass(frozen=True)
-class FullHeldOut:
-    """Score of the observed frame that training never saw; before is the avatar at step 0."""
-
-    frame: int
-    protocol: str
-    psnr_before: float
-    psnr_after: float
-    ssim_before: float
-    ssim_after: float
 
 
 @dataclass(frozen=True)
@@ -49,7 +36,7 @@ class FullResult:
 
     avatar: Avatar
     losses: tuple[FullRow, ...]
-    held_out: FullHeldOut | None
+    held_out: HeldOut | None
     notes: tuple[str, ...]
     corrections: dict[str, float]
 
@@ -58,7 +45,7 @@ def train_full(
     inputs: FullInputs,
     config: FullConfig,
     info: AvatarInfo,
-    progress: FullProgress | None = None,
+    progress: Progress | None = None,
     *,
     perceptual: Perceptual | None = None,
     preview: Preview | None = None,
@@ -95,7 +82,7 @@ def train_full(
 def _train(
     trainer: Trainer,
     config: FullConfig,
-    progress: FullProgress | None,
+    progress: Progress | None,
     preview: Preview | None,
     checkpoint: Path | None,
 ) -> None:
@@ -125,9 +112,9 @@ def _training_poses(inputs: FullInputs, plan: Plan) -> Tensor:
     return torch.cat(rows)
 
 
-def _held_out(trainer: Trainer, plan: Plan, inputs: FullInputs) -> FullHeldOut | None:
+def _held_out(trainer: Trainer, plan: Plan, inputs: FullInputs) -> HeldOut | None:
     if plan.held_out is None:
         return None
     before, after = trainer.first_score, trainer.score()
     protocol = INPUT_VIEW.id(*inputs.observed.frames.shape[2:])
-    return FullHeldOut(plan.held_out[0], protocol, before[0], after[0], before[1], after[1])
+    return HeldOut(plan.held_out[0], protocol, before[0], after[0], before[1], after[1])
