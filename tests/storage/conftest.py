@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from storage_schema.store import ArtifactStore
+from storage_schema.tables import Tables
 
 from .toy import open_store
 
@@ -21,3 +22,8 @@ def store(request: pytest.FixtureRequest, tmp_path: Path) -> ArtifactStore:
 @pytest.fixture
 def disk_store(tmp_path: Path) -> ArtifactStore:
     return open_store(tmp_path / "store", tmp_path / "cache")
+
+
+@pytest.fixture
+def tables(store: ArtifactStore) -> Tables:
+    return Tables(store)
