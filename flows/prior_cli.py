@@ -6,7 +6,6 @@ import json
 from pathlib import Path
 from typing import Annotated
 
-import torch
 import typer
 from rich.console import Console
 
@@ -29,7 +28,7 @@ def corpus(
     from ahoy_core.prior.corpus.shards import ShardId, claimed, make_shard
     from ahoy_core.prior.corpus.wardrobe import SPLITS, Wardrobe
 
-    torch.set_num_threads(1)
+    _use_threads(1)
     folder.mkdir(parents=True, exist_ok=True)
     body, wardrobe = load_packaged_body(), Wardrobe(assets)
     held = [ShardId(split, k) for k in range(held_out) for split in SPLITS if split != "train"]
@@ -54,7 +53,7 @@ def train(
     from ahoy_core.prior.train.loop import Schedule
     from tasks import prior_training
 
-    torch.set_num_threads(threads)
+    _use_threads(threads)
     schedule = Schedule(lr=lr, minutes=minutes, cooldown=cooldown, log_steps=20 if what == "flow" else 50)
 
     def note(row: dict[str, float]) -> None:
@@ -78,7 +77,7 @@ def encode(
     """Turn shards into the latents that the flow is trained on; what is there stays."""
     from tasks import prior_training
 
-    torch.set_num_threads(threads)
+    _use_threads(threads)
     prior_training.encode_corpus(corpus_folder, out, lambda name: console.print(name, highlight=False), every)
 
 
@@ -94,7 +93,7 @@ def evaluate(
     from ahoy_core.prior.evaluate import held_out
     from ahoy_core.prior.video import load_video
 
-    torch.set_num_threads(threads)
+    _use_threads(threads)
     figures = held_out(load_video(prior), corpus_folder, clips)
     out.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
     console.print_json(data=figures)
@@ -111,3 +110,9 @@ def card(
 
     path = write_card(folder, corpus_folder, json.loads(figures.read_text(encoding="utf-8")))
     console.print(str(path), highlight=False)
+
+
+def _use_threads(count: int) -> None:
+    import torch  # not with the module: every other command would wait for it
+
+    torch.set_num_threads(count)
