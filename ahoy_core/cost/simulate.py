@@ -8,7 +8,6 @@ from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
 import simpy
 
 WORKER = "worker"
@@ -145,7 +144,7 @@ class _Counted:
 
     def use(self, makespan_s: float, idle_s: float) -> Use:
         """Totals as rates."""
-        whole = max(makespan_s, np.finfo(float).tiny)
+        whole = makespan_s if makespan_s > 0 else 1.0
         wait = self.waited_s / max(self._requests, 1)
         return Use(self._capacity, (self._busy_s - idle_s) / (self._capacity * whole), wait, self.waited_s / whole)
 

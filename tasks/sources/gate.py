@@ -80,6 +80,12 @@ class _Handler(BaseHTTPRequestHandler):
         lines += ["Connection: close", "", ""]
         with upstream:
             upstream.sendall("\r\n".join(lines).encode("latin-1"))
+            status, end, rest = _first_line(upstream)
+            if not end:
+                self.send_error(502)
+                return
+            # The client must hear that this connection ends here: its next request on it would meet the end.
+            self.connection.sendall(status + b"\r\nConnection: close\r\n" + rest)
             self._relay(upstream)
 
     do_GET = do_HEAD = do_POST = _forward  # noqa: N815 - the names that http.server calls
@@ -118,3 +124,17 @@ class _Handler(BaseHTTPRequestHandler):
 
     def log_message(self, format: str, *args: object) -> None:
         """Nothing: addresses may hold secrets."""
+
+
+def _first_line(upstream: socket.socket) -> tuple[bytes, bytes, bytes]:
+    """The line, its end (nothing if it never came) and what came with it."""
+    head = b""
+    while b"\r\n" not in head and len(head) < _BLOCK:
+        try:
+            data = upstream.recv(_BLOCK)
+        except OSError:
+            data = b""
+        if not data:
+            break
+        head += data
+    return head.partition(b"\r\n")

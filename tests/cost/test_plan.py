@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from ahoy_core.cost.plan import plan
@@ -35,6 +35,7 @@ BATCHES = st.lists(
 
 
 @given(BATCHES)
+@example([video(("fetch", 0.0), overhead_s=2e-309)])
 def test_one_worker_takes_the_sum_and_is_never_idle(batch: list[MeasuredVideo]) -> None:
     run = simulate(batch, Fleet(1))
     assert run.makespan_s == pytest.approx(sum(map(total, batch)))

@@ -100,7 +100,7 @@ def test_splits_share_no_held_out_garment_and_captures_are_in_none() -> None:
 
 def test_outfits_follow_from_the_seed() -> None:
     one, two = (random_outfit(np.random.default_rng(5), "train") for _ in range(2))
-    assert torch.equal(one.betas, two.betas) and (one.suit, one.shell, one.hair) == (two.suit, two.shell, two.hair)
+    assert torch.equal(one.betas, two.betas) and (one.suit, one.cloth, one.hair) == (two.suit, two.cloth, two.hair)
 
 
 def test_garment_colours_cover_hues_and_greys() -> None:

@@ -96,8 +96,8 @@ class Dresser:
             image = texture(garment.diffuse if has_texture else None, garment.occlusion, kind not in ("hair", "brows"))
             for k in (KINDS.index(kind), KINDS.index("lower")) if kind == "upper" else (KINDS.index(kind),):
                 textures[k], textured[k] = image, has_texture
-        if outfit.shell is not None:
-            pieces += _shell_pieces(self.chart, outfit.shell, vertices, normals)
+        if outfit.cloth is not None:
+            pieces += _shell_pieces(self.chart, outfit.cloth, vertices, normals)
         if outfit.hair == "cap":
             cap = hair_cap(self.chart, vertices, normals, 0.004 + 0.02 * float(outfit.betas[5]))
             pieces.append(_plain(cap.vertices, cap.lbs_weights, cap.faces, "hair"))

@@ -49,8 +49,8 @@ class Outfit:
 
     Attributes:
         betas: [S] of the packaged body.
-        suit: a MakeHuman suit, or None where a `shell` is worn.
-        shell: procedural clothes, or None.
+        suit: a MakeHuman suit, or None where `cloth` is worn.
+        cloth: procedural clothes, or None.
         shoes: MakeHuman shoes, or None (barefoot).
         hair: MakeHuman hair; "cap" for short procedural hair; None for bald.
         brows: MakeHuman eyebrows.
@@ -59,7 +59,7 @@ class Outfit:
 
     betas: Tensor
     suit: str | None
-    shell: Shell | None
+    cloth: Shell | None
     shoes: str | None
     hair: str | None
     brows: str
@@ -76,7 +76,7 @@ def random_outfit(rng: np.random.Generator, split: Split) -> Outfit:
     return Outfit(
         betas=_betas(rng, female),
         suit=suit,
-        shell=_shell(rng) if shell else None,
+        cloth=_shell(rng) if shell else None,
         shoes=None if shell and rng.random() < 0.08 else str(rng.choice(shoes)),
         hair=_hair(rng, split),
         brows=str(rng.choice(wardrobe.BROWS)),
