@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from datetime import UTC, datetime, timedelta
 from typing import Any, Literal
 from uuid import UUID
 
@@ -14,12 +15,13 @@ from prefect.runtime import flow_run
 from pydantic import BaseModel, ConfigDict, Field
 
 from flows.batch.feeder import Feeder
-from flows.batch.queue import Queue
+from flows.batch.queue import Queue, QueueError
 from storage_schema.batches import is_cancelled, resume_batch
 from storage_schema.status import BatchStatus, select
 from storage_schema.store import ArtifactStore
 
 UPDATE_S = 5.0
+MOST_CRASHES, CRASHES_WITHIN = 20, timedelta(hours=1)
 Rerun = Literal["no", "unfinished", "failed", "crashed", "cancelled"]
 
 
@@ -61,6 +63,7 @@ async def feed_batch(request: FeedRequest) -> dict[str, int]:
     async with get_client() as client:
         queue = Queue(client, store.url, request.batch)
         await queue.adopt(flow_run.id)
+        await _check_crashes(queue)
         show = Progress(request.batch)
         limits = request.outstanding, request.tries, request.poll_s, request.pending_s
         feeder = Feeder(store, queue, *limits, get_run_logger(), show)
@@ -71,6 +74,16 @@ async def feed_batch(request: FeedRequest) -> dict[str, int]:
         ended = await feeder.feed(chosen)
         await acreate_table_artifact(_rows(feeder.status()), key="batch", description=f"how {request.batch} ended")
     return dict(ended)
+
+
+async def _check_crashes(queue: Queue) -> None:
+    """End a chain of feeders that crash, each of which has the next one as its successor (`flows.serve.install`)."""
+    crashed = await queue.count_crashed_feeders(datetime.now(UTC) - CRASHES_WITHIN)
+    if crashed > MOST_CRASHES:
+        raise QueueError(
+            f"expected at most {MOST_CRASHES} feeders of batch {queue.batch} to crash within {CRASHES_WITHIN}, got "
+            f"{crashed}: see the workers' logs, then submit the list again"
+        )
 
 
 class Progress:

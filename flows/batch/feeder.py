@@ -101,6 +101,8 @@ class Feeder:
                 if todo is None:
                     todo = plan(self.status().records, await self.queue.seen(), self.tries, chosen)
                     total = len(todo.due) + len(todo.live)
+                    if chosen is not None:  # from here on it is the batch's own work, whoever feeds it
+                        self._append([_announced(item) for item in todo.due])
                     self.log.info("%s: %d to start, %d under way", self.queue.batch, len(todo.due), len(todo.live))
                 await self._watch(todo)
                 await self._top_up(todo)

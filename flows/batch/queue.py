@@ -6,6 +6,7 @@ import asyncio
 import hashlib
 from collections.abc import AsyncIterator, Iterable, Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from typing import Any
 from uuid import UUID
 
@@ -15,6 +16,7 @@ from prefect.client.schemas.filters import (
     FlowFilterName,
     FlowRunFilter,
     FlowRunFilterId,
+    FlowRunFilterStartTime,
     FlowRunFilterState,
     FlowRunFilterStateType,
     FlowRunFilterTags,
@@ -111,6 +113,15 @@ class Queue:
         """How many runs of videos have not ended, whoever created them."""
         return await self.client.count_flow_runs(
             flow_filter=FlowFilter(name=FlowFilterName(any_=[PROCESS_VIDEO])), flow_run_filter=self._filter(True)
+        )
+
+    async def count_crashed_feeders(self, since: datetime) -> int:
+        """How many feeders of the batch that began after a time have crashed."""
+        crashed = FlowRunFilterState(type=FlowRunFilterStateType(any_=[StateType.CRASHED]))
+        began = FlowRunFilterStartTime(after_=since)
+        return await self.client.count_flow_runs(
+            flow_filter=FlowFilter(name=FlowFilterName(any_=[FEED_BATCH])),
+            flow_run_filter=FlowRunFilter(tags=FlowRunFilterTags(all_=self.tags), state=crashed, start_time=began),
         )
 
     async def create(self, work: Sequence[Work], parameters: Sequence[dict[str, Any]]) -> list[str]:

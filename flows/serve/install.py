@@ -1,4 +1,4 @@
-"""What Ahoy needs inside Prefect, installed by one call that may be repeated: pool, deployments, limits, automation."""
+"""What Ahoy needs inside Prefect, installed by one repeatable call: pools, deployments, limits, automations."""
 
 from __future__ import annotations
 
@@ -6,10 +6,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import timedelta
 from typing import Any
+from uuid import UUID
 
 from prefect.client.orchestration import PrefectClient, get_client
 from prefect.client.schemas.actions import WorkPoolCreate
-from prefect.events.actions import ChangeFlowRunState
+from prefect.events.actions import ChangeFlowRunState, RunDeployment
 from prefect.events.schemas.automations import AutomationCore, EventTrigger, Posture
 from prefect.exceptions import ObjectNotFound
 from prefect.states import StateType
@@ -26,7 +27,8 @@ ENTRYPOINTS: Mapping[str, str] = {
     FEED_BATCH: "flows.feed_batch.feed_batch",
 }
 SILENT_S = 75  # two heartbeats missed, and half of one more for delays; found within 120 s with room to spare
-AUTOMATION = "ahoy: runs that fell silent have crashed"
+SILENCE = "ahoy: runs that fell silent have crashed"
+SUCCESSION = "ahoy: a feeder that crashed has a successor"
 _HEARTBEAT = "prefect.flow-run.heartbeat"
 
 
@@ -58,9 +60,12 @@ async def install(installation: Installation = Installation()) -> None:
             await _pool(client, pool)
         for name, slots in vars(installation.limits).items():
             await client.upsert_global_concurrency_limit_by_name(name, slots)
-        for flow, entrypoint in installation.entrypoints.items():
-            await _deployment(client, entrypoint, POOLS[flow])
-        await _automation(client)
+        deployments = {
+            flow: await _deployment(client, entrypoint, POOLS[flow])
+            for flow, entrypoint in installation.entrypoints.items()
+        }
+        for automation in (_silence(), _succession(deployments[FEED_BATCH])):
+            await _automation(client, automation)
 
 
 async def _pool(client: PrefectClient, name: str) -> None:
@@ -72,10 +77,10 @@ async def _pool(client: PrefectClient, name: str) -> None:
         await client.create_work_pool(WorkPoolCreate(name=name, type="process", base_job_template=template))
 
 
-async def _deployment(client: PrefectClient, entrypoint: str, pool: str) -> None:
+async def _deployment(client: PrefectClient, entrypoint: str, pool: str) -> UUID:
     flow: Any = import_object(entrypoint)
     flow_id = await client.create_flow(flow)
-    await client.create_deployment(
+    return await client.create_deployment(
         flow_id=flow_id,
         name=DEPLOYMENT,
         description=flow.description,
@@ -95,13 +100,13 @@ def _schema(flow: Any) -> Any:
     return parameter_schema(flow).model_dump(exclude_unset=True)
 
 
-async def _automation(client: PrefectClient) -> None:
+def _silence() -> AutomationCore:
     """Mark runs Crashed that began and then, without having ended, sent no heartbeat for `SILENT_S`."""
     ends = ("Completed", "Failed", "TimedOut", "Cancelled", "Crashed")
     waits = ("AwaitingRetry", "Paused", "Suspended", "Scheduled", "Pending")
     signs = {_HEARTBEAT} | {f"prefect.flow-run.{state}" for state in (*ends, *waits)}
-    wanted = AutomationCore(
-        name=AUTOMATION,
+    return AutomationCore(
+        name=SILENCE,
         description="A worker that dies with its run tells nobody. Ahoy's flows send a heartbeat every 30 s.",
         trigger=EventTrigger(
             posture=Posture.Proactive,
@@ -115,7 +120,36 @@ async def _automation(client: PrefectClient) -> None:
         ),
         actions=[ChangeFlowRunState(state=StateType.CRASHED, message=f"no heartbeat for {SILENT_S} s")],
     )
-    found = await client.read_automations_by_name(AUTOMATION)
+
+
+def _succession(feeder: UUID) -> AutomationCore:
+    """Start a feeder in the place of one that crashed, with the same limits.
+
+    It goes on with the batch and selects nothing: what its predecessor was to run again is announced in the ledger.
+    """
+    goes_on = "dict(flow_run.parameters['request'], rerun='no', stage=none, error=none, videos=[])"
+    request = {
+        "__prefect_kind": "json",
+        "value": {"__prefect_kind": "jinja", "template": "{{ " + goes_on + " | tojson }}"},
+    }
+    return AutomationCore(
+        name=SUCCESSION,
+        description="The feeder of a batch dies with its worker; the next worker goes on.",
+        trigger=EventTrigger(
+            posture=Posture.Reactive,
+            expect={"prefect.flow-run.Crashed"},
+            match={"prefect.resource.id": "prefect.flow-run.*"},
+            match_related={"prefect.resource.role": "flow", "prefect.resource.name": FEED_BATCH},
+            for_each={"prefect.resource.id"},
+            threshold=1,
+            within=timedelta(0),
+        ),
+        actions=[RunDeployment(source="selected", deployment_id=feeder, parameters={"request": request})],
+    )
+
+
+async def _automation(client: PrefectClient, wanted: AutomationCore) -> None:
+    found = await client.read_automations_by_name(wanted.name)
     if found:
         await client.update_automation(found[0].id, wanted)
     else:

@@ -24,6 +24,9 @@ QUIET = {
 WORKER_SETTINGS = {
     "PREFECT_FLOWS_HEARTBEAT_FREQUENCY": "30",  # seconds; the shortest that Prefect allows
     "PREFECT_WORKER_QUERY_SECONDS": "2",  # how often an idle worker asks for work
+    # While its database restarts the server answers 500 as well as 503; a run waits four minutes for it, not one.
+    "PREFECT_CLIENT_RETRY_EXTRA_CODES": "500",
+    "PREFECT_CLIENT_MAX_RETRIES": "7",
 }
 # Postgres refuses to run as root, and the user that it then runs as cannot enter /root.
 _ROOT_FOLDER = Path("/var/lib/ahoy/server")

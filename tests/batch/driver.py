@@ -55,11 +55,6 @@ class Batch:
 
         wait_for(ended, f"the end of {self.name}", limit_s)
 
-    def again_until_ended(self) -> None:
-        """Submit once more where the feeder may have ended with its worker, and wait."""
-        self.submit()
-        self.wait_ended()
-
     def rerun(self, *words: str) -> str:
         return self.ahoy("rerun", self.name, "--poll", "0.3", *words).output
 
