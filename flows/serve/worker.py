@@ -16,6 +16,8 @@ from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
+import psutil
+from prefect.client.schemas.objects import FlowRun
 from prefect.utilities.processutils import command_to_string
 from prefect.workers.process import ProcessJobConfiguration, ProcessWorker
 
@@ -23,6 +25,7 @@ from flows.serve import nursery, relay
 from flows.serve.errors import ServerError
 
 FEEDERS = 4  # batches that one worker feeds at a time, beside its videos: feeding is light
+HAND_OVER_S = 20.0  # for runs to end by themselves; one that does not is found by its silence
 _SOCKET = "AHOY_NURSERY"
 
 
@@ -45,6 +48,11 @@ with warnings.catch_warnings():
 
         type = "process"
         job_configuration = WarmJobConfiguration
+        leaving = False
+
+        async def get_and_submit_flow_runs(self) -> list[FlowRun]:
+            """Take what is scheduled; nothing any more once the worker is leaving."""
+            return [] if self.leaving else await super().get_and_submit_flow_runs()
 
 
 @contextmanager
@@ -76,7 +84,7 @@ def running_nursery() -> Iterator[None]:
 
 
 def work(pools: Mapping[str, int], name: str | None) -> None:
-    """Take runs until interrupted (SIGINT or SIGTERM); runs at work are then told to stop.
+    """Take runs until interrupted (SIGINT or SIGTERM); runs at work are then told to stop, and others take them up.
 
     Args:
         pools: name of a work pool -> how many of its runs at a time.
@@ -89,9 +97,29 @@ def work(pools: Mapping[str, int], name: str | None) -> None:
 
 async def _work(pools: Mapping[str, int], name: str) -> None:
     workers = [WarmWorker(work_pool_name=pool, limit=limit, name=name) for pool, limit in pools.items()]
-    task = asyncio.gather(*(worker.start() for worker in workers))
-    loop = asyncio.get_running_loop()
+    told = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
-        loop.add_signal_handler(number, task.cancel)
+        asyncio.get_running_loop().add_signal_handler(number, told.set)
+    working = asyncio.gather(*(worker.start() for worker in workers))
+    stop = asyncio.create_task(told.wait())
+    either: set[asyncio.Future[Any]] = {working, stop}
+    await asyncio.wait(either, return_when=asyncio.FIRST_COMPLETED)
+    if told.is_set():
+        for worker in workers:
+            worker.leaving = True
+        await _end_runs()
+        working.cancel()
+    stop.cancel()
     with suppress(asyncio.CancelledError):
-        await task
+        await working
+
+
+async def _end_runs() -> None:
+    """Let the runs say that they end, in the ledger and to Prefect; cancelled, the worker would kill them at once."""
+    runs = [child for child in psutil.Process().children() if relay.__file__ in child.cmdline()]
+    for run in runs:
+        with suppress(psutil.NoSuchProcess):
+            run.terminate()
+    deadline = asyncio.get_running_loop().time() + HAND_OVER_S
+    while any(run.is_running() for run in runs) and asyncio.get_running_loop().time() < deadline:
+        await asyncio.sleep(0.1)

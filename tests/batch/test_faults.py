@@ -116,11 +116,12 @@ def test_a_worker_told_to_stop_hands_its_video_over(server: Server, workers: Wor
     _at(batch, "one")
     worker.send_signal(signal.SIGTERM)
     assert worker.wait(60) == 0
+    said = [row for row in batch.rows("attempts") if row["state"] == "crashed"]
+    assert [row["error_class"] for row in said] == ["TerminationSignal"], "the run itself said so"
     workers(2)
-    batch.wait_ended()
+    wait_for(lambda: batch.states() == {"done": 1}, "another worker to make it")
     toy = batch.toys["one"]
-    assert batch.states() == {"done": 1} and toy.count("made") == ONCE
-    assert toy.count("start") == {**ONCE, "perceive": 2}
+    assert toy.count("made") == ONCE and toy.count("start") == {**ONCE, "perceive": 2}
 
 
 def test_an_orphan_and_its_rerun_make_one_artifact(server: Server, workers: Workers, tmp_path: Path) -> None:
