@@ -142,9 +142,7 @@ def _follow(
         previous = t
         if int(shot[t]) not in shots_with_subject:
             continue
-        reading = _read_first(networks, frames[t], _candidates(roi, track, t))
-        if reading and belongs_to_another(reading.next_roi(), track, tracks, t):
-            reading = None
+        reading = _read_first(networks, frames[t], _candidates(roi, track, t), track, tracks, t)
         roi = reading.next_roi() if reading else None
         if reading:
             readings[t].append(reading)
@@ -164,10 +162,13 @@ def _candidates(followed: Roi | None, track: Track, t: int) -> list[Roi]:
     return [followed, detected] if drift < MAX_DRIFT else [detected, followed]
 
 
-def _read_first(networks: Networks, frame: NDArray[np.uint8], rois: list[Roi]) -> Reading | None:
+def _read_first(
+    networks: Networks, frame: NDArray[np.uint8], rois: list[Roi], track: Track, tracks: list[Track], t: int
+) -> Reading | None:
+    """The reading of the first crop that shows a person, and not another one."""
     for roi in rois:
         reading = read_crop(networks, frame, roi)
-        if reading.score >= MIN_SCORE:
+        if reading.score >= MIN_SCORE and not belongs_to_another(reading.next_roi(), track, tracks, t):
             return reading
     return None
 

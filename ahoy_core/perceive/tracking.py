@@ -20,6 +20,8 @@ GAP_GROWTH = 0.03  # of the crop, that the place grows uncertain by in each fram
 LOOKS = 1.2  # weight of appearance against place: two who cross are told apart by their clothes
 STRANGER = 0.7  # unlikeness from which it is another person, wherever they are
 SAME_PERSON = 0.52  # unlikeness up to which people of two shots are the same
+SLIPPED = 0.2  # of a crop, from somebody's detection, up to which a reading may be theirs
+TELLING = 0.05  # and by how much farther the subject's own detection has to be
 MEMORY = 8  # last detections that give a track's velocity
 FADE = 0.9  # share of the old appearance that is kept at each new detection
 IMPOSSIBLE = 1e6
@@ -179,8 +181,16 @@ def choose(tracks: list[Track], shot: np.ndarray, subject: int | None) -> Track:
 
 
 def belongs_to_another(roi: Roi, subject: Track, others: Sequence[Track], frame: int) -> bool:
-    """Whether a followed crop has slipped onto somebody else: theirs was detected here, the subject's was not."""
-    if frame in subject.rois:
-        return False
-    near = [t.rois[frame] for t in others if t is not subject and frame in t.rois]
-    return any(np.hypot(roi.cx - r.cx, roi.cy - r.cy) < 0.2 * r.size for r in near)
+    """Whether a crop has slipped onto somebody else: it lies on theirs, and not on the subject's where that was found.
+
+    Who passes in front takes the landmark network's eye even in the subject's own crop.
+    """
+    own = subject.rois.get(frame)
+    away = np.inf if own is None else _apart(roi, own)
+    near = [_apart(roi, t.rois[frame]) for t in others if t is not subject and frame in t.rois]
+    return any(distance < SLIPPED and distance + TELLING < away for distance in near)
+
+
+def _apart(roi: Roi, of: Roi) -> float:
+    """Distance of two crops' centres, in sides of the second."""
+    return float(np.hypot(roi.cx - of.cx, roi.cy - of.cy)) / of.size

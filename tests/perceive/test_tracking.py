@@ -85,7 +85,11 @@ def test_a_followed_crop_that_slips_onto_somebody_else_is_noticed() -> None:
     mine, other = Track({0: Roi(10, 50, 50, 0)}), Track({0: Roi(90, 50, 50, 0), 1: Roi(60, 50, 50, 0)})
     assert belongs_to_another(Roi(58, 50, 50, 0), mine, [mine, other], 1)
     assert not belongs_to_another(Roi(12, 50, 50, 0), mine, [mine, other], 1)
-    assert not belongs_to_another(Roi(90, 50, 50, 0), mine, [mine, other], 0)
+    # Where the subject was found as well, the nearer of the two decides, and neither is accused when they are one heap.
+    assert belongs_to_another(Roi(90, 50, 50, 0), mine, [mine, other], 0)
+    assert not belongs_to_another(Roi(14, 50, 50, 0), mine, [mine, other], 0)
+    heap = Track({0: Roi(12, 50, 50, 0)})
+    assert not belongs_to_another(Roi(11, 50, 50, 0), mine, [mine, heap], 0)
 
 
 def test_no_person_and_a_subject_that_is_not_there_are_clear_errors() -> None:
