@@ -1,4 +1,4 @@
-"""Videos in object stores, through fsspec's in-memory file system and one that breaks."""
+"""Videos in object stores: a real S3 server, fsspec's in-memory file system, and one that breaks."""
 
 from __future__ import annotations
 
@@ -12,10 +12,23 @@ from fsspec.implementations.memory import MemoryFileSystem
 
 from tasks.errors import MissingExtraError, MissingSourceError, RefusedSourceError, UnusableSourceError
 from tasks.sources import SourcePolicy, fetch_source
+from tests.storage.s3 import s3_bucket, s3_server
 
 
-@pytest.fixture
-def bucket() -> Iterator[str]:
+@pytest.fixture(scope="module")
+def s3() -> Iterator[int]:
+    pytest.importorskip("s3fs", reason="needs the extra ahoy[s3]")
+    pytest.importorskip("moto", reason="needs moto[server]")
+    with s3_server() as port:
+        yield port
+
+
+@pytest.fixture(params=["memory", "s3"])
+def bucket(request: pytest.FixtureRequest) -> Iterator[str]:
+    if request.param == "s3":
+        with s3_bucket(request.getfixturevalue("s3")) as name:
+            yield f"s3://{name}"
+        return
     url = f"memory://{uuid.uuid4().hex}"
     yield url
     fs = fsspec.filesystem("memory")
@@ -25,7 +38,7 @@ def bucket() -> Iterator[str]:
 
 @pytest.fixture
 def policy() -> SourcePolicy:
-    return SourcePolicy(object_protocols=("memory", "flaky", "gs"), attempts=4, backoff_s=0.001)
+    return SourcePolicy(object_protocols=("memory", "s3", "flaky", "gs"), attempts=4, backoff_s=0.001)
 
 
 def put(url: str, data: bytes) -> str:

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 import time
+import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -56,6 +57,25 @@ def s3_server() -> Iterator[int]:
     finally:
         server.kill()
         server.wait()
+
+
+@contextmanager
+def s3_bucket(port: int) -> Iterator[str]:
+    """Name of an empty bucket; until the end `s3://` leads to the server, its own tries cut short."""
+    import s3fs
+
+    before, tries = dict(fsspec.config.conf), s3fs.S3FileSystem.retries
+    s3fs.S3FileSystem.retries = 2
+    use(f"http://127.0.0.1:{port}")
+    name = f"b-{uuid.uuid4().hex[:12]}"
+    make_bucket(port, name)
+    try:
+        yield name
+    finally:
+        fsspec.config.conf.clear()
+        fsspec.config.conf.update(before)
+        s3fs.S3FileSystem.retries = tries
+        s3fs.S3FileSystem.clear_instance_cache()
 
 
 def make_bucket(port: int, name: str) -> None:

@@ -7,7 +7,6 @@ import os
 import subprocess
 import sys
 import time
-import uuid
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,7 @@ from storage_schema.errors import CorruptError, StoreError, StoreFullError, Stor
 from storage_schema.store import ArtifactStore
 from storage_schema.tables import Tables
 
-from .s3 import CHANGES, CREDENTIALS, Proxy, make_bucket, proxy_before, s3_server, use
+from .s3 import CHANGES, CREDENTIALS, Proxy, proxy_before, s3_bucket, s3_server, use
 from .toy import ARTIFACTS, KEY, commit, load, open_store, publish, written
 
 s3fs = pytest.importorskip("s3fs", reason="needs the extra ahoy[s3]")
@@ -36,17 +35,10 @@ def server() -> Iterator[int]:
 
 
 @pytest.fixture
-def bucket(server: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+def bucket(server: int) -> Iterator[str]:
     """Name of an empty bucket; `s3://` leads to the server."""
-    monkeypatch.setattr(s3fs.S3FileSystem, "retries", 2)
-    before = dict(fsspec.config.conf)
-    use(f"http://127.0.0.1:{server}")
-    name = f"b-{uuid.uuid4().hex[:12]}"
-    make_bucket(server, name)
-    yield name
-    fsspec.config.conf.clear()
-    fsspec.config.conf.update(before)
-    s3fs.S3FileSystem.clear_instance_cache()
+    with s3_bucket(server) as name:
+        yield name
 
 
 @pytest.fixture
