@@ -29,6 +29,7 @@ ENTRYPOINTS: Mapping[str, str] = {
 SILENT_S = 75  # two heartbeats missed, and half of one more for delays; found within 120 s with room to spare
 SILENCE = "ahoy: runs that fell silent have crashed"
 SUCCESSION = "ahoy: a feeder that crashed has a successor"
+_JOB_VARIABLES = ("env", "working_dir")
 _HEARTBEAT = "prefect.flow-run.heartbeat"
 
 
@@ -73,8 +74,15 @@ async def _pool(client: PrefectClient, name: str) -> None:
     try:
         await client.read_work_pool(name)
     except ObjectNotFound:
-        template = ProcessWorker.get_default_base_job_template()
-        await client.create_work_pool(WorkPoolCreate(name=name, type="process", base_job_template=template))
+        await client.create_work_pool(WorkPoolCreate(name=name, type="process", base_job_template=_job_template()))
+
+
+def _job_template() -> dict[str, Any]:
+    """The process worker's own template, less what our runs never set: the server checks all of it for every run."""
+    whole: Any = ProcessWorker.get_default_base_job_template()
+    configuration = {name: whole["job_configuration"][name] for name in _JOB_VARIABLES}
+    variables = {name: whole["variables"]["properties"][name] for name in _JOB_VARIABLES}
+    return {"job_configuration": configuration, "variables": {"type": "object", "properties": variables}}
 
 
 async def _deployment(client: PrefectClient, entrypoint: str, pool: str) -> UUID:

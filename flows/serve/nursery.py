@@ -22,10 +22,16 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
+# The flows, and what Prefect and they import only once they run.
 PRELOADED = (
     "prefect.flow_engine",
+    "prefect.task_engine",
     "prefect.deployments",
     "prefect.concurrency.sync",
+    "prefect.utilities.visualization",
+    "anyio._backends._asyncio",
+    "pyarrow.compute",
+    "storage_schema.remote",
     "flows.process_video",
     "flows.feed_batch",
 )

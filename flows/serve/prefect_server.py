@@ -57,6 +57,8 @@ class PrefectServer:
             "PREFECT_SERVER_LOGGING_LEVEL": os.environ.get("PREFECT_SERVER_LOGGING_LEVEL", "WARNING"),
             "PREFECT_UI_API_URL": "/api",
             "PREFECT__SERVER_FINAL": "1",
+            # It looks at every run that was cancelled lately, one by one: every 20 s that is a third of a core for 200.
+            "PREFECT_SERVER_SERVICES_CANCELLATION_CLEANUP_LOOP_SECONDS": "300",
             **({"PREFECT_SERVER_API_AUTH_STRING": self.auth} if self.auth else {}),
         }
         command = [sys.executable, "-m", "uvicorn", "--factory", "prefect.server.api.server:create_app"]

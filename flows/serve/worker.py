@@ -15,9 +15,12 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
+from uuid import UUID
 
+import httpx
 import psutil
 from prefect.client.schemas.objects import FlowRun
+from prefect.exceptions import PrefectHTTPStatusError
 from prefect.utilities.processutils import command_to_string
 from prefect.workers.process import ProcessJobConfiguration, ProcessWorker
 
@@ -53,6 +56,16 @@ with warnings.catch_warnings():
         async def get_and_submit_flow_runs(self) -> list[FlowRun]:
             """Take what is scheduled; nothing any more once the worker is leaving."""
             return [] if self.leaving else await super().get_and_submit_flow_runs()
+
+        def _release_limit_slot(self, flow_run_id: UUID) -> None:
+            """Ask for work as soon as there is room for it, not only every few seconds."""
+            super()._release_limit_slot(flow_run_id)
+            if self._runs_task_group is not None and not self.leaving:
+                self._runs_task_group.start_soon(self._fill_slot)
+
+        async def _fill_slot(self) -> None:
+            with suppress(httpx.HTTPError, PrefectHTTPStatusError):  # the regular round will ask again
+                await self.get_and_submit_flow_runs()
 
 
 @contextmanager
