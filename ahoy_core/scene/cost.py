@@ -60,13 +60,13 @@ class Rates:
         face: Per avatar with an expression, once: what each action does; a frame then takes under a millisecond.
     """
 
-    gaussian: float = 4.5e-8
-    visible: float = 1.2e-7
-    intersection: float = 1.17e-7
-    pixel: float = 6.6e-8
-    skin: float = 0.028
+    gaussian: float = 1.0e-7
+    visible: float = 2e-8
+    intersection: float = 1.6e-7
+    pixel: float = 3.5e-8
+    skin: float = 0.004
     joints: float = 0.004
-    pose: float = 1.0e-6
+    pose: float = 5.5e-7
     carry: float = 4.0e-7
     pair: float = 2.8e-8
     shade: float = 3.6e-7
@@ -130,9 +130,9 @@ def calibrate(seconds: float = 0.4) -> Rates:
         seconds: CPU time to spend, about; the fastest run counts, as other work only ever slows one down.
     """
     generator = torch.Generator().manual_seed(0)
-    count, size = 8000, 256
+    count, size = 40_000, 512
     means = torch.randn(count, 3, generator=generator) * torch.tensor([0.5, 0.5, 0.9])
-    covars = (0.02**2 * torch.eye(3)).expand(count, 3, 3).contiguous()
+    covars = (0.01**2 * torch.eye(3)).expand(count, 3, 3).contiguous()
     opacities, colors = torch.full((count,), 0.8), torch.rand(count, 3, generator=generator)
     view = look_at(torch.tensor([0.0, -4.0, 0.0]), torch.zeros(3))
     cameras = Cameras(view[None], perspective_K(0.7, size, size)[None], size, size)

@@ -19,7 +19,7 @@ from ahoy_core.scene.cost import Rates
 from ahoy_core.scene.effects.effect import Effect, Verdict
 from ahoy_core.scene.shot import Content, Shot
 
-MOST_SAMPLES = 16
+MOST_SAMPLES = 10
 # Pixels: less blur than this is less than the rasterizer's own; between samples a gap this wide does not show.
 _LEAST_BLUR, _GAP, _LENS_GAP = 1.0, 1.5, 1.0
 _GOLDEN = math.pi * (3 - math.sqrt(5))
