@@ -11,8 +11,9 @@ QUIET_PIP := --disable-pip-version-check --quiet
 demo: models  ## the main job on the bundled clip; prints where the avatar, the video and the report are
 	OMP_WAIT_POLICY=passive $(BIN)/ahoy run ahoy_core/assets/demo.mp4 --out out/demo
 
-test: models lint  ## style, types, layers, then the whole suite
-	OMP_NUM_THREADS=1 OMP_WAIT_POLICY=passive $(BIN)/pytest --numprocesses auto --dist loadfile
+test: models lint  ## style, types, layers, then the whole suite, one process more than cores: some tests mostly wait
+	OMP_NUM_THREADS=1 OMP_WAIT_POLICY=passive $(BIN)/pytest --dist loadfile \
+		--numprocesses $$($(BIN)/python -c 'import os; print((os.cpu_count() or 1) + 1)')
 
 lint: $(INSTALLED)
 	$(BIN)/ruff check .

@@ -22,7 +22,8 @@ def ask(gate: Gate, url: str) -> bytes:
 
 def test_an_answer_says_that_its_connection_ends(server: Served, policy: SourcePolicy) -> None:
     """Otherwise a client keeps the connection, and its next request may be sent into the end of it."""
-    with open_gate(policy) as gate:
+    soon = policy.model_copy(update={"read_timeout_s": 0.5})  # this server keeps its end open, whatever it is asked
+    with open_gate(soon) as gate:
         answer = ask(gate, server.file("/a", b"body", Connection="keep-alive"))
     head, _, body = answer.partition(b"\r\n\r\n")
     lines = head.split(b"\r\n")
