@@ -125,4 +125,4 @@ def _roles(config: FullConfig) -> Mapping[str, Role]:
     return {"body": packaged_body(), "rasterizer": ours("ahoy_core.splat on the CPU"), **perceptual_role()}
 
 
-AVATAR = Stage("avatar", 1, FullConfig, ("ingest", "perceive", "texture", "coarse"), run_avatar, _roles)
+AVATAR = Stage("avatar", 2, FullConfig, ("ingest", "perceive", "texture", "coarse"), run_avatar, _roles)

@@ -56,6 +56,7 @@ def coarse_sequences(
                 transl=torch.zeros(views, 3),
                 cameras=cameras,
                 alphas=shown.alphas[:, 0].clamp(0, 1),
+                keeps_head=True,
             )
         )
     return tuple(made)

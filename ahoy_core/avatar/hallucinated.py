@@ -39,6 +39,8 @@ class Supervision:
         transl: [T,3] metres, world.
         cameras: T cameras of the full resolution.
         alphas: [T,h,w] alpha of the person, or None where the generator gives none.
+        keeps_head: Its head supervises, too. The paper leaves it out because a prior repaints faces badly; what was
+            not repainted is all that shows the head from behind, and without it that part would be anything.
     """
 
     name: str
@@ -50,6 +52,7 @@ class Supervision:
     transl: Tensor
     cameras: Cameras
     alphas: Tensor | None = None
+    keeps_head: bool = False
 
     def __post_init__(self) -> None:
         count, size = len(self.frames), tuple(self.frames.shape[2:])
@@ -90,7 +93,7 @@ def sequence_shots(
         kinematics: The person's skeleton.
         template: The bare body, to tell head from body.
         weights: Weights of covered pixels and of those beside the person.
-        head_split: Leave out the head's pixels (equation 6).
+        head_split: Leave out the head's pixels (equation 6) of sequences that do not keep their head.
 
     Returns:
         Per sequence its usable shots; and notes.
@@ -104,7 +107,8 @@ def sequence_shots(
             if _fault(sequence, index):
                 notes.append(f"sequence {sequence.name!r}, frame {index} not used: {_fault(sequence, index)}")
                 continue
-            shots.append(_shot(sequence, index, number, row, kinematics, template, weights, head_split))
+            without_head = head_split and not sequence.keeps_head
+            shots.append(_shot(sequence, index, number, row, kinematics, template, weights, without_head))
             row += 1
         groups.append(shots)
     return groups, notes
@@ -127,7 +131,7 @@ def _shot(
     kinematics: Kinematics,
     template: Template,
     weights: FullWeights,
-    head_split: bool,
+    without_head: bool,
 ) -> Shot:
     camera, factor = sequence.cameras[index], sequence.factor
     rotations = axis_angle_to_matrix(sequence.pose[index].float())
@@ -141,7 +145,7 @@ def _shot(
     person = alpha if alpha is not None else ((target - GREY).abs().amax(0) > _PERSON).float().maximum(bare)
     weight = person + (1 - person) * weights.outside
     weight = weight * (1 - (1 - weights.covered) * sequence.coverage[index].float().clamp(0, 1))
-    if head_split:
+    if without_head:
         weight = weight * (1 - head_zone(shares, head_reach(kinematics, template, relative, small)))
     y0, y1, x0, x1 = _crop(person.maximum(bare))
     cut = (slice(None), slice(y0, y1), slice(x0, x1))

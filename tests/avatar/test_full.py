@@ -157,6 +157,9 @@ def test_head_pixels_are_left_out_of_the_body_loss_and_only_there():
         head = float((shares[number, 0] > 0.5).sum())
         assert head <= float(gone.sum()) < 4 * head
         assert torch.equal(with_split.weight[~gone], without.weight[~gone])
+    keeps = replace(sequence(), keeps_head=True)
+    (kept,) = sequence_shots([keeps], kinematics(), template(), weights, True)[0]
+    assert all(torch.equal(a.weight, b.weight) for a, b in zip(kept, whole, strict=True))
 
 
 def test_a_hallucinated_pixel_weighs_little_where_the_video_showed_the_surface():

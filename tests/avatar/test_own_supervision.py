@@ -12,6 +12,8 @@ from ahoy_core.avatar.avatar import bake, network_config
 from ahoy_core.avatar.coarse_renders import coarse_sequences
 from ahoy_core.avatar.deform import OffsetBounds, offset_channels
 from ahoy_core.avatar.face_views import observed_faces
+from ahoy_core.avatar.full_config import FullWeights
+from ahoy_core.avatar.hallucinated import sequence_shots
 from ahoy_core.avatar.render import render
 from ahoy_core.maps import StyleUNet
 from tests.avatar.full_scenes import kinematics, raised
@@ -43,6 +45,16 @@ def test_the_whole_person_is_in_every_coarse_render():
     rim[1:-1, 1:-1] = False
     assert float(sequence.alphas[:, rim].max()) < 0.05
     assert float(sequence.alphas.amax((1, 2)).min()) > 0.9
+
+
+def test_coarse_renders_hold_the_head_which_nothing_else_shows_from_behind():
+    (sequence,) = coarse_sequences(_avatar(0.0), body(), raised(0.0)[None], views=2, height=48, width=40)
+    weights = FullWeights()
+    shots, without = (
+        sequence_shots([one], kinematics(), template(), weights, head_split=True)[0][0]
+        for one in (sequence, replace(sequence, keeps_head=False))
+    )
+    assert all(float(a.weight.sum()) > float(b.weight.sum()) for a, b in zip(shots, without, strict=True))
 
 
 def test_coverage_of_coarse_renders_is_the_observed_share_of_the_surface():
