@@ -30,7 +30,7 @@ class Viewed:
     """What was found to show.
 
     Attributes:
-        avatars: By name ("coarse", "full"), the best one last.
+        avatars: By name, the best one last; before the avatar of a run, the coarse one that it was made from.
         frames: [T,H,W,3] of the source, or None where they are not kept.
         source: [A,A] frame of each texel, or None.
     """
@@ -47,31 +47,33 @@ def find(path: Path) -> Viewed:
         FileNotFoundError: No avatar there.
     """
     if (path / DESCRIPTION).is_file():
-        folders = {"coarse": path}
+        folders = {path.name: path}
     else:
         found = sorted(path.glob(f"*/{DESCRIPTION}"))
         if not found:
             raise FileNotFoundError(f"expected an avatar ({DESCRIPTION}) in {path} or a folder in it, found none")
         folders = {file.parent.name: file.parent for file in found}
     avatars = {name: load_avatar(folder) for name, folder in folders.items()}
-    for name, folder in list(folders.items()):
-        if (folder / "full" / DESCRIPTION).is_file():
-            avatars[f"{name} full"] = load_avatar(folder / "full")
+    if len(avatars) == 1 and (coarse := _newest(path, f"artifacts/coarse/*/attempts/*/{DESCRIPTION}")):
+        avatars = {"coarse": load_avatar(coarse.parent), **avatars}
     frames, source = _evidence(path)
     return Viewed(avatars, frames, source)
 
 
+def _newest(path: Path, pattern: str) -> Path | None:
+    """The newest of a run's own artifacts, None where there is no store near it."""
+    for root in (path / "store", path.parent / "store"):
+        if found := sorted(root.glob(pattern), key=lambda file: file.stat().st_mtime):
+            return found[-1]
+    return None
+
+
 def _evidence(path: Path) -> tuple[NDArray[np.uint8] | None, NDArray[np.int32] | None]:
     """Frames and the atlas' source frames from the newest artifacts of the run's own store, if it is there."""
-    for root in (path / "store", path.parent / "store"):
-        if root.is_dir():
-            frames, atlas = (
-                sorted(root.rglob(name), key=lambda file: file.stat().st_mtime) for name in ("frames.npz", "atlas.npz")
-            )
-            if frames and atlas:
-                source = load_npz(atlas[-1], ["source_frame"])["source_frame"]
-                return load_npz(frames[-1], ["frames"])["frames"], source
-    return None, None
+    frames, atlas = (_newest(path, f"artifacts/*/*/attempts/*/{name}.npz") for name in ("frames", "atlas"))
+    if not frames or not atlas:
+        return None, None
+    return load_npz(frames, ["frames"])["frames"], load_npz(atlas, ["source_frame"])["source_frame"]
 
 
 class Viewer:
@@ -164,7 +166,7 @@ class Viewer:
         return tuple(np.ascontiguousarray(part.detach().numpy(), np.float32) for part in parts)
 
     def _look(self, client: Any) -> None:
-        client.camera.position, client.camera.look_at = (0.9, -2.9, 1.3), (0.0, 0.0, 0.85)
+        client.camera.position, client.camera.look_at = (0.5, -1.7, 1.1), (0.0, 0.0, 0.85)
 
     def _controls(self) -> None:
         gui = self.server.gui

@@ -106,9 +106,12 @@ def test_what_is_there_is_found(tmp_path: Path):
     with pytest.raises(FileNotFoundError, match="expected an avatar"):
         find(tmp_path)
     save_avatar(avatar(), tmp_path / "talk-1234")
-    save_avatar(avatar(), tmp_path / "talk-1234" / "full")
-    assert list(find(tmp_path).avatars) == ["talk-1234", "talk-1234 full"]
-    assert list(find(tmp_path / "talk-1234").avatars) == ["coarse", "coarse full"]
+    assert list(find(tmp_path).avatars) == ["talk-1234"]
+    for made in ("early", "late"):
+        save_avatar(avatar(), tmp_path / "store" / "artifacts" / "coarse" / "key" / "attempts" / made)
+    assert list(find(tmp_path).avatars) == list(find(tmp_path / "talk-1234").avatars) == ["coarse", "talk-1234"]
+    save_avatar(avatar(), tmp_path / "walk-1234")
+    assert list(find(tmp_path).avatars) == ["talk-1234", "walk-1234"], "of two people, whose coarse one?"
 
 
 def test_a_browser_shows_the_avatar(viewer: Viewer, tmp_path: Path):
