@@ -24,10 +24,11 @@ from ahoy_core.conventions import Cameras
 from ahoy_core.cost import machine
 from ahoy_core.prior.canonical import CanonicalFill, check_prior
 from ahoy_core.prior.conditioning import Context
+from ahoy_core.prior.config import IdentityConfig
 from ahoy_core.prior.corpus.prompts import NEUTRAL
 from ahoy_core.prior.corpus.shards import shards
 from ahoy_core.prior.evaluate import held_out, load_clips, psnr, round_trips
-from ahoy_core.prior.identity import Frames, IdentityConfig, train_identity
+from ahoy_core.prior.identity import Frames, train_identity
 from ahoy_core.prior.inversion import clean_up
 from ahoy_core.prior.solvers import EVALUATIONS
 from ahoy_core.prior.subject import subject_frames

@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ahoy_core.prior.conditioning import Context, held_tokens
+from ahoy_core.prior.config import InversionConfig
 from ahoy_core.prior.corpus.dress import KINDS, Kind
 from ahoy_core.prior.corpus.prompts import NEUTRAL
 from ahoy_core.prior.corpus.shards import read_shard, shards
 from ahoy_core.prior.corpus.wardrobe import SPLITS
-from ahoy_core.prior.inversion import InversionConfig, clean_up, hallucinate
+from ahoy_core.prior.inversion import clean_up, hallucinate
 from ahoy_core.prior.solvers import Solver, sigma_grid, solve, steps_for
 from ahoy_core.prior.train.frames import autoencoder_psnr
 from ahoy_core.prior.video import VideoModel
