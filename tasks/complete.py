@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import json
-import math
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -29,11 +28,14 @@ SIDES = ("front", "left", "back", "right")
 
 
 class CompleteConfig(BaseModel):
-    """How much is hidden before a prior is believed."""
+    """How much is hidden before a prior is believed, and whether the outcome decides."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     regions: int = Field(default=3, ge=1, description="observed regions hidden one after the other")
+    believe: Literal["winner", "prior"] = Field(
+        default="winner", description="prior: whatever the self-check says, for comparisons"
+    )
     seed: int = Field(default=0, ge=0, description="of the regions and of the prior's noise")
 
 
@@ -49,16 +51,17 @@ def run_complete(config: CompleteConfig, ctx: StageContext) -> StageOutput:
     video = load_video(prior_folder(ctx.prior))
     fill = CanonicalFill(body, betas, observed)
     check = check_prior(video, fill, config.seed, config.regions)
-    used = check.winner != BASELINE
+    winner = check.winner if config.believe == "winner" else _best_prior(check.errors)
+    used = winner != BASELINE
     if used:
-        _recolour(video, check.winner, config.seed, fill, atlas, (body, betas, observed), ctx)
+        _recolour(video, winner, config.seed, fill, atlas, (body, betas, observed), ctx)
     else:
         for name in ("atlas.npz", "canonical.npz"):
             shutil.copyfile(ctx.inputs["texture"] / name, ctx.out / name)
     found = {
-        "winner": check.winner,
+        "winner": winner,
         "errors": check.errors,
-        "confidence": None if math.isnan(check.confidence) else check.confidence,
+        "confidence": check.errors.get(winner),
         "regions": check.regions,
         "hidden_pixels": check.pixels,
         "note": check.note,
@@ -66,6 +69,12 @@ def run_complete(config: CompleteConfig, ctx: StageContext) -> StageOutput:
     }
     (ctx.out / "complete.json").write_text(json.dumps(found, indent=1), encoding="utf-8")
     return StageOutput(_summary(found), ("completed.png",) if used else ())
+
+
+def _best_prior(errors: Mapping[str, float]) -> str:
+    from ahoy_core.prior.canonical import CLEAN_UP, INVERSION
+
+    return min((CLEAN_UP, INVERSION), key=lambda name: errors.get(name, 0.0))
 
 
 def _recolour(

@@ -1,4 +1,4 @@
-"""Stage `identity`: fine-tunes the prior on the subject's frames, one low-rank update and one word (paper 3.2, eq. 2)."""
+"""Stage `identity`: fine-tunes the prior on the subject: a low-rank update and one word (paper 3.2, equation 2)."""
 
 from __future__ import annotations
 

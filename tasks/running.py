@@ -154,8 +154,8 @@ def _resolve(
         manifest = store.lookup(value.key, stage=value.stage)
         if manifest is None:
             raise FileNotFoundError(
-                f"stage {stage.title}: expected the artifact of {name} ({value.key[:12]}) whole in the store, got none; "
-                f"run {name} again: it makes the artifact anew"
+                f"stage {stage.title}: expected the artifact of {name} ({value.key[:12]}) whole in the store, got "
+                f"none; run {name} again: it makes the artifact anew"
             )
         manifests[name], folders[name] = manifest, store.fetch(manifest)
     return manifests, folders
