@@ -67,7 +67,9 @@ def read_sequence(folder: Path, item: str) -> PlannedSequence:
     if item not in numbers:
         raise KeyError(f"expected one of {sorted(numbers)}, got {item!r}; plan the motions again")
     row = numbers[item]
-    arrays = {name: torch.from_numpy(np.asarray(value[row])) for name, value in load_npz(folder / "motions.npz").items()}
+    arrays = {
+        name: torch.from_numpy(np.asarray(value[row])) for name, value in load_npz(folder / "motions.npz").items()
+    }
     return PlannedSequence(
         name=told[row]["name"],
         kind=told[row]["kind"],

@@ -69,20 +69,6 @@ def texel_normals(texels: TexelMap, vertices: FloatArray, surface: Surface) -> F
     return face_normals(vertices, surface.faces)[texels.face]
 
 
-def face_coverage(coverage: FloatArray, texels: TexelMap, surface: Surface) -> FloatArray:
-    """Observed share [F] of each triangle, from the coverage [A,A] of an atlas.
-
-    A triangle smaller than a texel has none of its own; it takes the mean of its corners, which know its neighbours.
-    """
-    faces = surface.faces
-    own = np.bincount(texels.face, minlength=len(faces))
-    seen = np.bincount(texels.face, coverage.ravel()[texels.flat] > 0, len(faces))
-    around = np.bincount(faces.ravel(), np.repeat(own, 3))
-    seen_around = np.bincount(faces.ravel(), np.repeat(seen, 3)) / np.maximum(around, 1)
-    share: FloatArray = np.where(own > 0, seen / np.maximum(own, 1), seen_around[faces].mean(axis=1))
-    return share
-
-
 def pad_charts(atlas: FloatArray, known: BoolArray) -> FloatArray:
     """Give every texel outside `known` the colour of the nearest known one: lookups at a border bleed no emptiness.
 
@@ -140,3 +126,13 @@ def sample_atlas(atlas: FloatArray, uv: FloatArray) -> FloatArray:
     """
     height, width = atlas.shape[:2]
     return sample_image(atlas, np.stack([uv[:, 0] * width, (1 - uv[:, 1]) * height], axis=1))
+
+
+def face_coverage(coverage: FloatArray, texels: TexelMap, surface: Surface) -> FloatArray:
+    """Observed share [F] of each triangle, from the coverage [A,A] of an atlas, looked up at the triangle's middle.
+
+    Most triangles are smaller than a texel, so counting a triangle's own texels would find none.
+    """
+    seen = pad_charts((coverage > 0).astype(np.float32), texels.chart)
+    share: FloatArray = sample_atlas(seen, surface.uvs[surface.uv_faces].mean(axis=1)) * surface.textured
+    return share
