@@ -18,8 +18,8 @@ from ahoy_core.prior.evaluate import (
     region_weight,
     repair_methods,
     repaired,
-    round_trips,
 )
+from ahoy_core.prior.round_trip import round_trips
 from ahoy_core.prior.video import VideoModel
 
 FRAMES, HEIGHT, WIDTH = 2, 64, 32
