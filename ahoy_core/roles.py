@@ -36,6 +36,20 @@ class Views(Protocol):
         ...
 
 
+def _prior_inpaint(*arguments: Any, **named: Any) -> Tensor:
+    """`PriorBody.inpaint`; the prior's libraries are imported with the first call."""
+    from ahoy_core.prior.views import PriorBody
+
+    return PriorBody.inpaint(*arguments, **named)
+
+
+def _prior_views(*arguments: Any, **named: Any) -> tuple[Tensor, tuple[float, ...]]:
+    """`PriorBody.views`, likewise."""
+    from ahoy_core.prior.views import PriorBody
+
+    return PriorBody.views(*arguments, **named)
+
+
 __all__ = ["COMPLETIONS", "FILLINGS", "Inpaint", "Perceptual", "Views"]
 
 COMPLETIONS: Final[Mapping[str, Completion]] = {
@@ -47,8 +61,8 @@ COMPLETIONS: Final[Mapping[str, Completion]] = {
 
 FILLINGS: Final[Mapping[str, Mapping[str, Callable[..., Any]]]] = {
     "body": {"packaged": load_packaged_body, "smpl": load_smpl},
-    "inpaint": {"textured body": TexturedBody.inpaint},
-    "views": {"textured body": TexturedBody.views},
+    "inpaint": {"textured body": TexturedBody.inpaint, "embedded prior": _prior_inpaint},
+    "views": {"textured body": TexturedBody.views, "embedded prior": _prior_views},
     "perceptual": {"ST-LPIPS": load_stlpips},
 }
-"""Role -> name -> what fills it: loaders of bodies, methods of a person's `TexturedBody`."""
+"""Role -> name -> what fills it: loaders of bodies, methods of a person's `TexturedBody` or `PriorBody`."""

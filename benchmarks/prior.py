@@ -3,7 +3,8 @@
 One JSON object. Held-out rendered people come from SHARDS (`ahoy prior corpus` makes them); captures from CAPTURES_DIR,
 whose subjects and clothes are in no split of the corpus. PSNRs are means over pictures in dB (peak 1), inside the named
 region alone; `gain` keys are differences in dB. `gradient` is gradient energy as a share of the truth's. Times are CPU
-seconds of this process on `threads` threads; `machine` says on what, and how busy it was.
+seconds of this process on `threads` threads; `machine` says on what, and how busy it was. `--parts` measures some of it
+and leaves what else the file holds: a long benchmark can be had in pieces.
 """
 
 from __future__ import annotations
@@ -24,11 +25,14 @@ from ahoy_core.conventions import Cameras
 from ahoy_core.cost import machine
 from ahoy_core.prior.canonical import CanonicalFill, check_prior
 from ahoy_core.prior.conditioning import Context
+from ahoy_core.prior.config import IdentityConfig
 from ahoy_core.prior.corpus.prompts import NEUTRAL
 from ahoy_core.prior.corpus.shards import shards
-from ahoy_core.prior.evaluate import held_out, load_clips, psnr, round_trips
-from ahoy_core.prior.identity import Frames, IdentityConfig, train_identity
+from ahoy_core.prior.corpus.wardrobe import SPLITS
+from ahoy_core.prior.evaluate import held_out, load_clips, psnr
+from ahoy_core.prior.identity import Frames, train_identity
 from ahoy_core.prior.inversion import clean_up
+from ahoy_core.prior.round_trip import round_trips
 from ahoy_core.prior.solvers import EVALUATIONS
 from ahoy_core.prior.subject import subject_frames
 from ahoy_core.prior.text import IDENTITY_PROMPT
@@ -42,6 +46,8 @@ _REFERENCE_STEPS = 32  # of RK4: 128 evaluations
 _CAMERAS = ("front", "left", "back", "right")
 _BANDS = {"torso": (0.1, 0.6), "legs": (-0.85, -0.1)}  # of the body's height in [-1,1]
 _IDENTITY_FRAMES = 12
+_PARTS = ("held-out", "round-trip", "captures")
+_HELD_OUT = tuple(split for split in SPLITS if split != "train")
 
 
 def static_views(capture: Capture, body: PackagedBody) -> Frames:
@@ -150,26 +156,31 @@ def main() -> None:
     parser.add_argument("--prior", type=Path, required=True, help="folder of the prior")
     parser.add_argument("--corpus", type=Path, help="folder with held-out shards")
     parser.add_argument("--clips", type=int, default=24, help="held-out clips of each split")
+    parser.add_argument("--splits", nargs="+", choices=_HELD_OUT, default=_HELD_OUT, help="held-out splits")
+    parser.add_argument("--parts", nargs="+", choices=_PARTS, default=_PARTS, help="what to measure")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--json", type=Path, required=True)
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
     start = time.process_time()
     video = load_video(arguments.prior)
-    found: dict[str, Any] = {
+    found: dict[str, Any] = json.loads(arguments.json.read_text(encoding="utf-8")) if arguments.json.exists() else {}
+    found |= {
         "machine": machine(),
         "threads": arguments.threads,
         "prior_load_cpu_seconds": round(time.process_time() - start, 2),
     }
-    if arguments.corpus is not None:
-        found["held_out"] = held_out(video, arguments.corpus, arguments.clips)
+    if arguments.corpus is not None and "held-out" in arguments.parts:
+        found["held_out"] = held_out(video, arguments.corpus, arguments.clips, arguments.splits)
+    if arguments.corpus is not None and "round-trip" in arguments.parts:
         some = load_clips(shards(arguments.corpus, "people")[0], 1).views([0, 2, 4, 6])
         found["round_trip"] = round_trips(video, some, _BUDGETS, tuple(EVALUATIONS), _REFERENCE_STEPS)
-    body = load_packaged_body()
-    found["captures"] = {
-        folder.name: capture_figures(lambda: load_video(arguments.prior), read_capture(folder), body)
-        for folder in capture_folders(arguments.captures)
-    }
+    if "captures" in arguments.parts:
+        body = load_packaged_body()
+        found["captures"] = {
+            folder.name: capture_figures(lambda: load_video(arguments.prior), read_capture(folder), body)
+            for folder in capture_folders(arguments.captures)
+        }
     arguments.json.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
 
 

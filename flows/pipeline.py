@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
+from tasks.running import run_stage, skip_stage
 from tasks.settings import Settings
-from tasks.stage import Run, Source, Stage, StageRef, run_stage, skip_stage
+from tasks.stage import Run, Source, Stage, StageRef
 from tasks.stages import STAGES
 
 Call = Callable[[Stage, Settings, Mapping[str, StageRef | Source], Run], StageRef]
@@ -15,7 +17,7 @@ Call = Callable[[Stage, Settings, Mapping[str, StageRef | Source], Run], StageRe
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a run left: a reference per stage that was run or found, and a reason per stage that was not."""
+    """What a run left: a reference per stage (and item) that was run or found, and a reason per stage that was not."""
 
     refs: Mapping[str, StageRef]
     skipped: Mapping[str, str]
@@ -53,13 +55,43 @@ def process(
     refs: dict[str, StageRef] = {}
     skipped: dict[str, str] = {}
     for stage in stages:
+        inputs = _inputs(stage, source, refs)
+        summaries = _summaries(stage, inputs, run)
         if stage.name not in wanted:
-            skipped[stage.name] = f"not asked for (--stages {','.join(only or ())})"
-            skip_stage(stage, skipped[stage.name], run)
+            reason = f"not asked for (--stages {','.join(only or ())})"
+        elif left_out := [name for name in stage.needs if name in skipped]:
+            reason = f"needs {left_out[0]}, which was skipped"
+        else:
+            reason = stage.obstacle(run, summaries) if stage.obstacle else ""
+        if reason:
+            skipped[stage.name] = reason
+            skip_stage(stage, reason, run)
             continue
-        inputs = {name: source if name == "source" else refs[name] for name in stage.needs}
-        refs[stage.name] = call(stage, settings, inputs, run)
+        for each in _mapped(stage, summaries):
+            refs[each.title] = call(each, settings, inputs, replace(run, skipped=dict(skipped)))
     return Outcome(refs, skipped)
+
+
+def _inputs(stage: Stage, source: Source, refs: Mapping[str, StageRef]) -> dict[str, StageRef | Source]:
+    """What the stage needs, and of what it wants that which was made."""
+    inputs: dict[str, StageRef | Source] = {"source": source} if "source" in stage.needs else {}
+    return inputs | {title: ref for title, ref in refs.items() if ref.stage in (*stage.needs, *stage.wants)}
+
+
+def _summaries(stage: Stage, inputs: Mapping[str, StageRef | Source], run: Run) -> dict[str, Mapping[str, Any]]:
+    """What the inputs found, for a stage that asks."""
+    if not (stage.obstacle or stage.over):
+        return {}
+    made = {title: ref for title, ref in inputs.items() if isinstance(ref, StageRef)}
+    manifests = {title: run.store.lookup(ref.key, stage=ref.stage, verify=False) for title, ref in made.items()}
+    return {title: {} if manifest is None else manifest.summary for title, manifest in manifests.items()}
+
+
+def _mapped(stage: Stage, summaries: Mapping[str, Mapping[str, Any]]) -> list[Stage]:
+    """The stage itself, or one for each item that it is mapped over."""
+    if not stage.over:
+        return [stage]
+    return [replace(stage, item=str(item)) for item in summaries[stage.over].get("items", ())]
 
 
 def _with_needs(only: Sequence[str] | None, stages: Sequence[Stage]) -> set[str]:
@@ -72,5 +104,5 @@ def _with_needs(only: Sequence[str] | None, stages: Sequence[Stage]) -> set[str]
     wanted = set(only)
     for stage in reversed(stages):  # later stages need earlier ones only
         if stage.name in wanted:
-            wanted |= set(stage.needs) - {"source"}
+            wanted |= {*stage.needs, *stage.wants} - {"source"}
     return wanted

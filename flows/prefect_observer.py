@@ -58,12 +58,12 @@ class PrefectObserver:
         if stage in self._bars:
             update_progress_artifact(self._bars[stage], percent, description=note or None)
         else:
-            made = create_progress_artifact(percent, key=f"progress-{stage}", description=note or stage)
+            made = create_progress_artifact(percent, key=_key(f"progress-{stage}"), description=note or stage)
             self._bars[stage] = made if isinstance(made, UUID) else UUID(str(made))
 
     def showed(self, stage: str, picture: Path) -> None:
         """Publish a picture of a stage at work; a later one takes its place on the page."""
-        create_markdown_artifact(_inline(picture), key=f"picture-{stage}", description=f"{stage} at work")
+        create_markdown_artifact(_inline(picture), key=_key(f"picture-{stage}"), description=f"{stage} at work")
 
     def finished(self, ref: StageRef, folder: Path) -> None:
         """Publish what the stage made if there is anything to see; an artifact costs the server a tenth of a second."""
@@ -72,11 +72,13 @@ class PrefectObserver:
             return
         bill = ref.bill
         lines = [
-            f"**{ref.stage}**: {ref.state}, {bill.wall_s:.1f} s, {bill.cpu_s:.1f} s CPU, {bill.peak_rss_mb:.0f} MB",
+            f"**{ref.title}**: {ref.state}, {bill.wall_s:.1f} s, {bill.cpu_s:.1f} s CPU, {bill.peak_rss_mb:.0f} MB",
             f"artifact `{ref.key[:16]}`",
         ]
         lines += [_inline(path) for path in pictures]
-        create_markdown_artifact("\n\n".join(lines), key=f"stage-{ref.stage}", description=f"what {ref.stage} made")
+        create_markdown_artifact(
+            "\n\n".join(lines), key=_key(f"stage-{ref.title}"), description=f"what {ref.title} made"
+        )
 
     def summary(self, outcome: Outcome, run: Run) -> None:
         """Publish the run as a whole: time per stage and what was skipped, scores, pictures, where things are."""

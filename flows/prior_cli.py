@@ -47,6 +47,7 @@ def train(
     minutes: Annotated[float, typer.Option(help="Wall time of this run.", min=0.0)] = 30.0,
     cooldown: Annotated[float, typer.Option(help="Last share of this run with a falling rate.", min=0, max=1)] = 0.0,
     lr: Annotated[float, typer.Option(help="Learning rate.", min=0.0)] = 2e-3,
+    horizon: Annotated[float, typer.Option(help="Steps that the averaged weights reach back.", min=1)] = 250.0,
     threads: Annotated[int, typer.Option(help="Threads.", min=1)] = 1,
 ) -> None:
     """Train for some minutes, or go on where the last run stopped."""
@@ -54,7 +55,8 @@ def train(
     from tasks import prior_training
 
     _use_threads(threads)
-    schedule = Schedule(lr=lr, minutes=minutes, cooldown=cooldown, log_steps=20 if what == "flow" else 50)
+    log_steps = 20 if what == "flow" else 50
+    schedule = Schedule(lr=lr, minutes=minutes, cooldown=cooldown, log_steps=log_steps, horizon=horizon)
 
     def note(row: dict[str, float]) -> None:
         console.print("  ".join(f"{name} {value:.4g}" for name, value in row.items()), highlight=False, soft_wrap=True)

@@ -29,9 +29,10 @@ from flows.subjects import each_subject
 from storage_schema.artifacts import ARTIFACTS, Blob
 from storage_schema.batches import is_cancelled
 from tasks.errors import is_transient
+from tasks.running import run_stage
 from tasks.settings import Settings
 from tasks.sources import parse_source, policy_from_environment, source_name
-from tasks.stage import Run, Source, Stage, StageRef, run_stage
+from tasks.stage import Run, Source, Stage, StageRef
 from tasks.stages import STAGES
 
 RETRIES, FIRST_DELAY_S, JITTER = 3, 2, 0.5
@@ -57,15 +58,15 @@ class Caller:
     stage: str = field(default="source", init=False)
 
     def __call__(self, stage: Stage, settings: Settings, inputs: Mapping[str, StageRef | Source], run: Run) -> StageRef:
-        """Run a stage as a Prefect task named after it."""
+        """Run a stage as a Prefect task named after it; of a mapped stage, each item is a task of its own."""
         self._enter(stage.name)
         if is_cancelled(run.store, run.batch):
-            raise BatchCancelledError(f"batch {run.batch} was cancelled before {stage.name}")
+            raise BatchCancelledError(f"batch {run.batch} was cancelled before {stage.title}")
 
         def body() -> dict[str, Any]:
             return run_stage(stage, getattr(settings, stage.name), inputs, run).to_json()
 
-        return StageRef.from_json(self._as_task(stage.name, run.video_id)(body)())
+        return StageRef.from_json(self._as_task(stage.title, run.video_id)(body)())
 
     def source(self, request: VideoRequest) -> Source:
         """Bring the video here; a task, so that waiting for it and trying again are seen."""

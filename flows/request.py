@@ -87,6 +87,7 @@ class VideoRequest(BaseModel):
             observer,
             self.settings().body,
             attempt_number=self.attempt,
+            prior=self.settings().prior,
         )
 
 

@@ -12,8 +12,9 @@ from typing import Any
 
 from flows.pipeline import Call, call_directly
 from tasks.ingest import INGEST
+from tasks.running import run_stage
 from tasks.settings import Settings
-from tasks.stage import Run, Source, run_stage
+from tasks.stage import Run, Source
 from tasks.subjects import SUBJECTS, SubjectsConfig
 
 SHEET = "subjects.png"

@@ -48,11 +48,11 @@ class TerminalObserver:
 
     def finished(self, ref: StageRef, folder: Path) -> None:
         """Close the bar and leave one line that says what the stage cost."""
-        self._progress.remove_task(self._bars.pop(ref.stage))
+        self._progress.remove_task(self._bars.pop(ref.title))
         if ref.state == "cached":
-            self._console.print(f"{ref.stage:<10} found in the store")
+            self._console.print(f"{ref.title:<10} found in the store")
         else:
             bill = ref.bill
             self._console.print(
-                f"{ref.stage:<10} {bill.wall_s:6.1f} s  ({bill.cpu_s:.1f} s CPU, {bill.peak_rss_mb:.0f} MB)"
+                f"{ref.title:<10} {bill.wall_s:6.1f} s  ({bill.cpu_s:.1f} s CPU, {bill.peak_rss_mb:.0f} MB)"
             )

@@ -28,6 +28,22 @@ class Blob:
     optional: bool = False
 
 
+_ATLAS: Mapping[str, Array] = {
+    "observed_rgb": Array("uint8", ("A", "A", 3)),  # first write wins; 0 where never seen
+    "coverage": Array("float32", ("A", "A")),  # [0,1], 0 where never seen
+    "source_frame": Array("int32", ("A", "A")),  # index into the ingested frames, -1 where never seen
+    "filled_rgb": Array("uint8", ("A", "A", 3)),  # complete
+    "chart": Array("bool", ("A", "A")),  # texel belongs to the body's surface
+}
+
+_CANONICAL: Mapping[str, Array] = {
+    "views": Array("uint8", (4, "Hc", "Wc", 4)),  # RGBA, straight alpha: front, left, back, right
+    "coverage": Array("uint8", (4, "Hc", "Wc")),  # observed share of each pixel, 0..255
+    "partial": Array("uint8", ("Hc", "Wc", 4)),  # I_*^part: the front view, observed texels only
+    "viewmats": Array("float32", (4, 4, 4)),
+    "Ks": Array("float32", (4, 3, 3)),  # orthographic
+}
+
 ARTIFACTS: Mapping[str, tuple[Blob, ...]] = {
     "ingest": (
         Blob(
@@ -76,29 +92,17 @@ ARTIFACTS: Mapping[str, tuple[Blob, ...]] = {
         Blob("subjects.json"),  # number, frames, shots, size of each; which are worth an avatar
     ),
     "texture": (
-        Blob(
-            "atlas.npz",
-            {
-                "observed_rgb": Array("uint8", ("A", "A", 3)),  # first write wins; 0 where never seen
-                "coverage": Array("float32", ("A", "A")),  # [0,1], 0 where never seen
-                "source_frame": Array("int32", ("A", "A")),  # index into the ingested frames, -1 where never seen
-                "filled_rgb": Array("uint8", ("A", "A", 3)),  # complete
-                "chart": Array("bool", ("A", "A")),  # texel belongs to the body's surface
-            },
-        ),
-        Blob(
-            "canonical.npz",
-            {
-                "views": Array("uint8", (4, "Hc", "Wc", 4)),  # RGBA, straight alpha: front, left, back, right
-                "coverage": Array("uint8", (4, "Hc", "Wc")),  # observed share of each pixel, 0..255
-                "partial": Array("uint8", ("Hc", "Wc", 4)),  # I_*^part: the front view, observed texels only
-                "viewmats": Array("float32", (4, 4, 4)),
-                "Ks": Array("float32", (4, 3, 3)),  # orthographic
-            },
-        ),
+        Blob("atlas.npz", _ATLAS),
+        Blob("canonical.npz", _CANONICAL),
         Blob("atlas.png"),  # observed, coverage, filled
         Blob("canonical.png"),  # the partial front and the four views
         Blob("texture.json"),
+    ),
+    "complete": (
+        Blob("atlas.npz", _ATLAS),  # as the texture's, `filled_rgb` by whoever won
+        Blob("canonical.npz", _CANONICAL),
+        Blob("completed.png", optional=True),  # the symmetric fill above the prior's; none where the first won
+        Blob("complete.json"),  # errors of all competitors on hidden regions, the winner
     ),
     "coarse": (
         Blob("avatar.safetensors"),
@@ -106,6 +110,44 @@ ARTIFACTS: Mapping[str, tuple[Blob, ...]] = {
         Blob("losses.parquet"),
         Blob("losses.png"),
         Blob("compare.png"),  # observed frames beside the avatar in their pose
+    ),
+    "identity": (
+        Blob("pytorch_lora_weights.safetensors"),  # diffusers' LoRA format
+        Blob("learned_embeds.safetensors"),  # the subject's word
+        Blob("losses.parquet"),
+        Blob("losses.png"),
+        Blob("before_after.png"),  # seen, drawn before the fine-tuning, drawn after it
+    ),
+    "motions": (
+        Blob(
+            "motions.npz",
+            {
+                "map_pose": Array("float32", ("Q", "J", 3)),  # the configuration that a sequence's frames share
+                "pose": Array("float32", ("Q", "T", "J", 3)),  # axis-angle, radians
+                "transl": Array("float32", ("Q", "T", 3)),  # metres, world
+                "viewmats": Array("float32", ("Q", "T", 4, 4)),
+                "Ks": Array("float32", ("Q", "T", 3, 3)),  # pixels of the prior's person images
+                "unseen": Array("float32", ("Q",)),  # share of the body that it shows and the video did not
+            },
+        ),
+        Blob("motions.json"),  # names, kinds and reasons; what was left out, and why
+    ),
+    "hallucinate": (  # one artifact for each planned motion
+        Blob(
+            "sequence.npz",
+            {
+                "frames": Array("uint8", ("T", "H", "W", 3)),  # over grey, observed pixels pasted over
+                "coverage": Array("uint8", ("T", "H", "W")),  # observed share, 0..255
+                "alphas": Array("uint8", ("T", "H", "W")),
+                "map_pose": Array("float32", ("J", 3)),
+                "pose": Array("float32", ("T", "J", 3)),  # of the motion that rendered the coarse input
+                "transl": Array("float32", ("T", 3)),
+                "viewmats": Array("float32", ("T", 4, 4)),
+                "Ks": Array("float32", ("T", 3, 3)),  # of the size in sequence.json, a multiple of the frames'
+            },
+        ),
+        Blob("sequence.json"),
+        Blob("before_after.png"),  # coarse renders above hallucinated frames
     ),
     "avatar": (
         Blob("avatar.safetensors"),

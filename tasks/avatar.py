@@ -18,14 +18,16 @@ from ahoy_core.avatar.files import load_avatar, save_avatar
 from ahoy_core.avatar.full import FullResult, train_full
 from ahoy_core.avatar.full_config import FullConfig
 from ahoy_core.avatar.full_inputs import FullInputs
+from ahoy_core.avatar.hallucinated import Supervision
 from ahoy_core.avatar.kinematics import Kinematics
 from ahoy_core.avatar.supervision import CoarseInputs
 from ahoy_core.body.canonical import canonical_pose
 from ahoy_core.formats.images import contact_sheet, to_uint8, write_png
 from ahoy_core.formats.npz import load_npz
+from tasks.hallucinate import read_supervision
 from tasks.roles import ours, packaged_body, perceptual_network, perceptual_role
 from tasks.stage import Role, Stage, StageContext, StageOutput
-from tasks.training import compare, draw_training, held_out_rows, load_inputs, training_summary
+from tasks.training import compare, completed_texture, draw_training, held_out_rows, load_inputs, training_summary
 
 PREVIEWS_SHOWN = 4
 COARSE_MAP_POSES = 3  # of coarse renders: the canonical pose and two of the video's that are far from it
@@ -35,10 +37,10 @@ TERMS = ("total", "body", "observed", "head", "perceptual", "regularisers", "cor
 def run_avatar(config: FullConfig, ctx: StageContext) -> StageOutput:
     """Train, save the avatar, and draw losses, pictures of the training and the comparison with the video."""
     coarse = load_avatar(ctx.inputs["coarse"])
-    observed = load_inputs(ctx.inputs["ingest"], ctx.inputs["perceive"], ctx.inputs["texture"], ctx.body)
+    observed = load_inputs(ctx.inputs["ingest"], ctx.inputs["perceive"], completed_texture(ctx), ctx.body)
     if not config.switches.full:
         return _keep_coarse(coarse, observed, ctx)
-    inputs, notes = _full_inputs(coarse, observed, config, ctx.inputs["perceive"])
+    inputs, notes = _full_inputs(coarse, observed, config, ctx)
     previews: list[tuple[int, np.ndarray]] = []
     checkpoint = checkpoint_path(config, ctx)
     result = train_full(
@@ -68,23 +70,32 @@ def checkpoint_path(config: FullConfig, ctx: StageContext) -> Path:
 
 
 def _full_inputs(
-    coarse: Avatar, observed: CoarseInputs, config: FullConfig, perceive: Path
+    coarse: Avatar, observed: CoarseInputs, config: FullConfig, ctx: StageContext
 ) -> tuple[FullInputs, list[str]]:
-    """What equation 9 asks for; the hallucinated sequences are coarse renders as long as no prior repaints them."""
+    """What equation 9 asks for; the hallucinated sequences are coarse renders where no prior repainted them."""
     template = coarse.template
     with torch.no_grad():
         base = template.gather(coarse.network(template.maps()))
-    expression = torch.from_numpy(load_npz(perceive / "body.npz", ["expression"])["expression"])
+    expression = torch.from_numpy(load_npz(ctx.inputs["perceive"] / "body.npz", ["expression"])["expression"])
     kinematics = Kinematics.of(observed.body, observed.betas.float())
     faces, reason = observed_faces(observed, template, kinematics, expression)
     if config.switches.supervise == "none":
         return FullInputs(observed, template, base, (), faces, reason), ["no sequences: switched off (B1)"]
+    if (made := _hallucinated(ctx)) and config.switches.supervise == "hallucinated":
+        note = f"supervised by {len(made)} hallucinated sequences: {', '.join(s.name for s in made)}"
+        return FullInputs(observed, template, base, made, faces, reason), [note]
     sequences = coarse_sequences(coarse, observed.body, _map_poses(observed))
     note = (
         "no prior has repainted the coarse renders (section 3.2): they supervise as they are, weighted by what the "
         "video never showed (ablation B2's data)"
     )
     return FullInputs(observed, template, base, sequences, faces, reason), [note]
+
+
+def _hallucinated(ctx: StageContext) -> tuple[Supervision, ...]:
+    return tuple(
+        read_supervision(folder) for title, folder in sorted(ctx.inputs.items()) if title.startswith("hallucinate/")
+    )
 
 
 def _map_poses(observed: CoarseInputs) -> torch.Tensor:
@@ -125,4 +136,12 @@ def _roles(config: FullConfig) -> Mapping[str, Role]:
     return {"body": packaged_body(), "rasterizer": ours("ahoy_core.splat on the CPU"), **perceptual_role()}
 
 
-AVATAR = Stage("avatar", 2, FullConfig, ("ingest", "perceive", "texture", "coarse"), run_avatar, _roles)
+AVATAR = Stage(
+    "avatar",
+    2,
+    FullConfig,
+    ("ingest", "perceive", "texture", "coarse"),
+    run_avatar,
+    _roles,
+    wants=("complete", "hallucinate"),
+)

@@ -10,14 +10,14 @@ from ahoy_core.avatar.config import CoarseConfig
 from ahoy_core.avatar.files import save_avatar
 from tasks.roles import body_role, ours, packaged_body, perceptual_network, perceptual_role
 from tasks.stage import Role, Stage, StageContext, StageOutput
-from tasks.training import draw_training, held_out_rows, load_inputs, training_summary
+from tasks.training import completed_texture, draw_training, held_out_rows, load_inputs, training_summary
 
 TERMS = ("total", "canonical", "observed", "regularisers", "perceptual")
 
 
 def run_coarse(config: CoarseConfig, ctx: StageContext) -> StageOutput:
     """Train, save the avatar, and draw the loss and the comparison with the video."""
-    inputs = load_inputs(ctx.inputs["ingest"], ctx.inputs["perceive"], ctx.inputs["texture"], ctx.body)
+    inputs = load_inputs(ctx.inputs["ingest"], ctx.inputs["perceive"], completed_texture(ctx), ctx.body)
     source = ctx.manifests["ingest"].inputs["source"]
     info = AvatarInfo(
         body=inputs.body.name, body_sha256=body_role(ctx.body).weights_sha256, provenance={"source_sha256": source}
@@ -42,4 +42,4 @@ def _roles(config: CoarseConfig) -> Mapping[str, Role]:
     return {"body": packaged_body(), "rasterizer": ours("ahoy_core.splat on the CPU"), **perceptual_role()}
 
 
-COARSE = Stage("coarse", 3, CoarseConfig, ("ingest", "perceive", "texture"), run_coarse, _roles)
+COARSE = Stage("coarse", 3, CoarseConfig, ("ingest", "perceive", "texture"), run_coarse, _roles, wants=("complete",))

@@ -13,14 +13,13 @@ from pydantic import BaseModel, ConfigDict
 from storage_schema.store import Manifest
 from tasks.stage import Stage, StageContext, StageOutput
 
-ABSENT = (
-    (
-        "complete: inpainting of the canonical image, generated side and back views (3.1)",
-        "not built yet; the atlas is completed by symmetry and diffusion over the surface instead",
-    ),
-    ("identity: LoRA fine-tuning of a video model (3.2)", "not built yet"),
-    ("hallucinate: RF-inversion of coarse renders (3.2)", "not built yet"),
-)
+STEPS = {
+    "complete": "complete: the prior against the symmetric fill of the texture (3.1)",
+    "identity": "identity: fine-tuning of the prior on the subject (3.2)",
+    "motions": "motions: planning of sequences from what the video left unseen (3.2)",
+    "hallucinate": "hallucinate: coarse renders through the prior and back (3.2)",
+}
+"""What a stage does, for those that may be skipped."""
 
 SECTIONS = {
     "ingest": ("The video", "What was read."),
@@ -32,7 +31,14 @@ SECTIONS = {
         "Texture and coverage",
         "What the video shows of the surface, and what was made up from it.",
     ),
+    "complete": (
+        "Prior or symmetric fill",
+        "Parts of what the video shows were hidden, and both had to guess them; who came closer completes the texture.",
+    ),
     "coarse": ("The coarse avatar", "Loss by step, and observed frames beside the avatar in their pose."),
+    "identity": ("The subject in the prior", "The prior before and after it was fine-tuned on this subject's frames."),
+    "motions": ("Motions", "Which sequences are worth hallucinating, and why."),
+    "hallucinate": ("Hallucinated", "A motion as the coarse avatar renders it, and as the prior repaints it."),
     "avatar": (
         "The full avatar",
         "Trained on the video and on sequences from all sides, with corrections of pose, camera and tone.",
@@ -45,8 +51,12 @@ CAPTIONS = {
     ("perceive", "overlay.png"): "left of each pair the mask and the landmarks, right the fitted body",
     ("texture", "atlas.png"): "texture of the body's surface: observed (first write wins), coverage, completed",
     ("texture", "canonical.png"): "the canonical pose: observed texels only, and the completed body from four sides",
+    ("complete", "completed.png"): "the canonical body from four sides: by the symmetric fill, and by the prior",
     ("coarse", "compare.png"): "frames of the video beside the whole avatar in the same pose, hidden parts included",
     ("coarse", "losses.png"): "terms of the objective by step, and the score of a frame held out of training",
+    ("identity", "before_after.png"): "frames of the video; what the prior draws in their place before, and after",
+    ("identity", "losses.png"): "loss of the fine-tuning by step",
+    ("hallucinate", "before_after.png"): "above the coarse renders, below the same frames hallucinated",
     ("avatar", "compare.png"): "frames of the video beside the whole avatar in the same pose, hidden parts included",
     ("avatar", "training.png"): "as the training went: what supervises above, the avatar below",
     ("avatar", "losses.png"): "terms of the objective by step, and the score of a frame held out of training",
@@ -87,23 +97,31 @@ def _content(ctx: StageContext) -> dict[str, Any]:
             _video(ctx, "turntable.mp4", "turntable"),
             _video(ctx, "motion.mp4", "a motion that the video does not show"),
         ],
-        "sections": [_section(ctx, name, ctx.manifests[name]) for name in SECTIONS],
+        "sections": [
+            _section(ctx, title, manifest)
+            for name in SECTIONS
+            for title, manifest in sorted(ctx.manifests.items())
+            if manifest.stage == name
+        ],
         "bills": [{**bill, "share": 100 * bill["wall_s"] / max(total, 1e-9)} for bill in bills],
         "total_wall": total,
         "total_cpu": sum(bill["cpu_s"] for bill in bills),
         "roles": list(roles.values()),
-        "absent": list(ABSENT),
+        "absent": [(STEPS.get(name, name), reason) for name, reason in ctx.skipped.items()],
     }
 
 
-def _section(ctx: StageContext, name: str, manifest: Manifest) -> dict[str, Any]:
-    title, text = SECTIONS[name]
+def _section(ctx: StageContext, title: str, manifest: Manifest) -> dict[str, Any]:
+    """A stage's section; `title` is the stage's, with the item of a mapped one."""
+    heading, text = SECTIONS[manifest.stage]
+    item = title.partition("/")[2].replace("-", " ")
     pictures = [
-        {"kind": "png", "caption": p, "data": _base64(ctx.inputs[name] / p)} for p in manifest.summary["pictures"]
+        {"kind": "png", "caption": CAPTIONS.get((manifest.stage, p), p), "data": _base64(ctx.inputs[title] / p)}
+        for p in manifest.summary["pictures"]
     ]
     facts = [(k.replace("_", " "), v) for k, v in manifest.summary.get("facts", {}).items()]
     return {
-        "title": title,
+        "title": f"{heading}: {item}" if item else heading,
         "text": text,
         "pictures": pictures,
         "notes": manifest.summary.get("notes", []),
@@ -119,4 +137,12 @@ def _base64(path: Path) -> str:
     return base64.b64encode(path.read_bytes()).decode()
 
 
-REPORT = Stage("report", 2, ReportConfig, ("ingest", "perceive", "texture", "coarse", "avatar", "animate"), run_report)
+REPORT = Stage(
+    "report",
+    3,
+    ReportConfig,
+    ("ingest", "perceive", "texture", "coarse", "avatar", "animate"),
+    run_report,
+    wants=("complete", "identity", "motions", "hallucinate"),
+    explains=True,
+)

@@ -14,6 +14,10 @@ from ahoy_core.ingest import IngestConfig
 from ahoy_core.perceive.perceive import PerceiveConfig
 from ahoy_core.texture.texture import TextureConfig
 from tasks.animate import AnimateConfig
+from tasks.complete import CompleteConfig
+from tasks.hallucinate import HallucinateConfig
+from tasks.identity import IdentityStageConfig
+from tasks.motions import MotionsConfig
 from tasks.report import ReportConfig
 
 Preset = Literal["draft", "standard", "high"]
@@ -25,10 +29,15 @@ class Settings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     body: str = Field(default="packaged", description='"packaged", or the path of your SMPL, SMPL+H or SMPL-X .npz')
+    prior: str = Field(default="packaged", description='"packaged", "none", or the folder of a prior (docs/prior.md)')
     ingest: IngestConfig = IngestConfig()
     perceive: PerceiveConfig = PerceiveConfig()
     texture: TextureConfig = TextureConfig()
+    complete: CompleteConfig = CompleteConfig()
     coarse: CoarseConfig = CoarseConfig()
+    identity: IdentityStageConfig = IdentityStageConfig()
+    motions: MotionsConfig = MotionsConfig()
+    hallucinate: HallucinateConfig = HallucinateConfig()
     avatar: FullConfig = FullConfig()
     animate: AnimateConfig = AnimateConfig()
     report: ReportConfig = ReportConfig()

@@ -24,6 +24,7 @@ from ahoy_core.body.load import PACKAGED, load_body
 from ahoy_core.conventions import Cameras
 from ahoy_core.formats.images import contact_sheet, to_float, write_png
 from ahoy_core.formats.npz import load_npz
+from tasks.stage import StageContext
 
 PAIRS_SHOWN = 4
 
@@ -33,6 +34,11 @@ def draw_training(result: CoarseResult | FullResult, terms: Sequence[str], input
     pq.write_table(pa.Table.from_pylist([dataclasses.asdict(row) for row in result.losses]), out / "losses.parquet")
     _plot_losses(result.losses, terms, out / "losses.png")
     compare(inputs, result.avatar, out / "compare.png")
+
+
+def completed_texture(ctx: StageContext) -> Path:
+    """The folder of atlas and canonical views: as the stage `complete` left them, where it ran."""
+    return ctx.inputs.get("complete", ctx.inputs["texture"])
 
 
 def load_inputs(ingest: Path, perceive: Path, texture: Path, body: str = PACKAGED) -> CoarseInputs:

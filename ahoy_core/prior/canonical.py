@@ -11,7 +11,8 @@ from torch import Tensor
 
 from ahoy_core.body.packaged import PackagedBody
 from ahoy_core.conventions import GREY, canonical_cameras
-from ahoy_core.prior.completion import Pictures, PriorConfig, pose_context, repaint
+from ahoy_core.prior.completion import Pictures, pose_context, repaint
+from ahoy_core.prior.config import PriorConfig
 from ahoy_core.prior.framing import HEIGHT, WIDTH
 from ahoy_core.prior.selfcheck import SelfCheck, self_check
 from ahoy_core.prior.video import VideoModel

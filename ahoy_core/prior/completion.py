@@ -3,39 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
-from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor
 
 from ahoy_core.body.packaged import PackagedBody
 from ahoy_core.conventions import Cameras
 from ahoy_core.prior.bodymaps import body_maps, camera_azimuth
 from ahoy_core.prior.conditioning import Context, held_tokens
+from ahoy_core.prior.config import PriorConfig
 from ahoy_core.prior.corpus.prompts import NEUTRAL
-from ahoy_core.prior.inversion import InversionConfig, clean_up, hallucinate
+from ahoy_core.prior.inversion import clean_up, hallucinate
 from ahoy_core.prior.video import VideoModel
-
-
-class PriorConfig(BaseModel):
-    """How the prior is asked.
-
-    Attributes:
-        method: "clean-up" reads the coarse latents as input; "inversion" goes through noise and back.
-        steps: of the clean-up; 1 is the posterior mean.
-        inversion: knobs of the other method.
-        hold: keep latents whose surface was well observed.
-        seed: of the noise.
-    """
-
-    model_config = ConfigDict(frozen=True)
-
-    method: Literal["clean-up", "inversion"] = "clean-up"
-    steps: int = Field(1, ge=1)
-    inversion: InversionConfig = InversionConfig()
-    hold: bool = True
-    seed: int = 0
 
 
 @dataclass(frozen=True)

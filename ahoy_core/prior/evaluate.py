@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ahoy_core.prior.conditioning import Context, held_tokens
+from ahoy_core.prior.config import InversionConfig
 from ahoy_core.prior.corpus.dress import KINDS, Kind
 from ahoy_core.prior.corpus.prompts import NEUTRAL
 from ahoy_core.prior.corpus.shards import read_shard, shards
 from ahoy_core.prior.corpus.wardrobe import SPLITS
-from ahoy_core.prior.inversion import InversionConfig, clean_up, hallucinate
-from ahoy_core.prior.solvers import Solver, sigma_grid, solve, steps_for
+from ahoy_core.prior.inversion import clean_up, hallucinate
 from ahoy_core.prior.train.frames import autoencoder_psnr
 from ahoy_core.prior.video import VideoModel
 
@@ -59,6 +59,10 @@ class Clips:
 
     def __len__(self) -> int:
         return len(self.frames)
+
+    def take(self, count: int) -> Clips:
+        """The first clips."""
+        return Clips(**{name: value[:count] for name, value in self.__dict__.items()})
 
     def views(self, frames: list[int]) -> Clips:
         """The same clips with some of their frames."""
@@ -137,18 +141,19 @@ def context_of(
     )
 
 
-def held_out(video: VideoModel, corpus: Path, clips: int) -> dict[str, Any]:
+def held_out(video: VideoModel, corpus: Path, clips: int, splits: Sequence[str] = SPLITS) -> dict[str, Any]:
     """Figures on the first shard of each split that the prior was not trained on.
 
     Args:
         video: the prior.
         corpus: folder of shards.
         clips: of each split, at most.
+        splits: which; the training's own is left out.
     """
     found: dict[str, Any] = {}
     for split in SPLITS:
         paths = shards(corpus, split)
-        if not paths or split == "train":
+        if not paths or split == "train" or split not in splits:
             continue
         turns = load_clips(paths[0], clips)
         back = back_from_front(video, turns)
@@ -163,6 +168,7 @@ def held_out(video: VideoModel, corpus: Path, clips: int) -> dict[str, Any]:
                 for region in ("torso", "legs")
             },
             "repaired": repaired(video, load_clips(paths[0], clips, turning=False), repair_methods(video)),
+            "cpu_seconds": sequence_seconds(video, turns.take(1)),
         }
     return found
 
@@ -287,51 +293,15 @@ def repair_methods(video: VideoModel, seed: int = 0) -> dict[str, Callable[[Tens
 
 
 @torch.no_grad()
-def round_trips(
-    video: VideoModel,
-    clips: Clips,
-    evaluations: tuple[int, ...],
-    solvers: tuple[Solver, ...],
-    reference_steps: int = 64,
-) -> list[dict[str, float | str]]:
-    """There and back through one field, and through two, for each solver and budget.
-
-    Returns:
-        Rows: solver, evaluations, round_trip and z1_error (root mean squares of normalized latents; z1 against RK4),
-        cross_field (back under the body and front, the case that is used: distance to the reference's result), seconds.
-    """
-    held = torch.zeros(*clips.part.shape[:2], clips.part.shape[2] // 16, clips.part.shape[3] // 16, dtype=torch.bool)
-    full = context_of(video, clips, held, coarse=False)
-    neutral = full.neutral(video.embed([""]).expand(len(clips), -1, -1))
-    clean = full.known
-    assert clean is not None
-
-    def field(context: Context) -> Callable[[Tensor, float], Tensor]:
-        return lambda z, tau: video.velocity(z, tau, context)
-
-    context = Context(full.text)
-    exact = solve(field(context), clean, sigma_grid(0, 1, reference_steps), "rk4").state
-    crossed = solve(field(neutral), exact, sigma_grid(1, 0, reference_steps), "rk4").state
-    rows: list[dict[str, float | str]] = []
-    for solver in solvers:
-        for budget in evaluations:
-            steps, start = steps_for(solver, budget), time.process_time()
-            there = solve(field(context), clean, sigma_grid(0, 1, steps), solver)
-            back = solve(field(context), there.state, sigma_grid(1, 0, steps), solver, partner=there.partner)
-            seconds = time.process_time() - start
-            other = solve(field(neutral), there.state, sigma_grid(1, 0, steps), solver)
-            rows.append(
-                {
-                    "solver": solver,
-                    "evaluations": budget,
-                    "round_trip": _rms(back.state - clean),
-                    "z1_error": _rms(there.state - exact),
-                    "cross_field": _rms(other.state - crossed),
-                    "cpu_seconds": seconds,
-                }
-            )
-    return rows
-
-
-def _rms(values: Tensor) -> float:
-    return float(values.square().mean().sqrt())
+def sequence_seconds(video: VideoModel, clip: Clips) -> dict[str, float]:
+    """CPU seconds that each method takes for one sequence, coding and decoding included."""
+    coverage = torch.minimum(clip.coverage, clip.mask)
+    held = held_tokens(coverage[:, :, 0], clip.mask[:, :, 0])
+    seconds = {}
+    for name, method in repair_methods(video).items():
+        start = time.process_time()
+        context = context_of(video, clip, held, coarse=True, frames=clip.coarse)
+        assert context.coarse is not None
+        video.decode(method(context.coarse, context))
+        seconds[name] = time.process_time() - start
+    return seconds

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -89,17 +91,32 @@ def load_components(folder: Path, dtype: torch.dtype = torch.float32) -> Compone
     from diffusers import WanTransformer3DModel
 
     second = None
-    if index.get("transformer_2", [None, None])[1] is not None:
-        second = WanTransformer3DModel.from_pretrained(folder, subfolder="transformer_2", **options).eval()
-    return Components(
-        transformer=WanTransformer3DModel.from_pretrained(folder, subfolder="transformer", **options).eval(),
-        transformer_2=second,
-        vae=_vae(folder, index).eval(),
-        text_encoder=_text_encoder(folder, dtype),
-        tokenizer=_tokenizer(folder),
-        boundary=index.get("boundary_ratio"),
-        expand_timesteps=bool(index.get("expand_timesteps", False)),
-    )
+    with _without_bars():
+        if index.get("transformer_2", [None, None])[1] is not None:
+            second = WanTransformer3DModel.from_pretrained(folder, subfolder="transformer_2", **options).eval()
+        return Components(
+            transformer=WanTransformer3DModel.from_pretrained(folder, subfolder="transformer", **options).eval(),
+            transformer_2=second,
+            vae=_vae(folder, index).eval(),
+            text_encoder=_text_encoder(folder, dtype),
+            tokenizer=_tokenizer(folder),
+            boundary=index.get("boundary_ratio"),
+            expand_timesteps=bool(index.get("expand_timesteps", False)),
+        )
+
+
+@contextmanager
+def _without_bars() -> Iterator[None]:
+    """Loads without the library's progress bar, which would be drawn over a run's own."""
+    from transformers.utils import logging
+
+    shown = logging.is_progress_bar_enabled()
+    logging.disable_progress_bar()
+    try:
+        yield
+    finally:
+        if shown:
+            logging.enable_progress_bar()
 
 
 def _index(folder: Path) -> dict[str, Any]:

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import torch
-from pydantic import BaseModel, ConfigDict, Field
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from ahoy_core.formats.atomic import atomic_path
 from ahoy_core.prior.conditioning import Context
+from ahoy_core.prior.config import IdentityConfig
 from ahoy_core.prior.text import IDENTITY_PROMPT, IDENTITY_TOKEN, embedding_weight, identity_token_id
 from ahoy_core.prior.video import VideoModel
 
@@ -24,28 +24,6 @@ _TARGETS: Final = ["to_q", "to_k", "to_v", "to_out.0", "ffn.net.0.proj", "ffn.ne
 _FILES: Final = ("pytorch_lora_weights.safetensors", "pytorch_lora_weights_2.safetensors")
 _TOKEN_FILE: Final = "learned_embeds.safetensors"
 _SEEN: Final = 0.5  # share of a latent's pixels that must be the visible person for it to count
-
-
-class IdentityConfig(BaseModel):
-    """Knobs of the fine-tuning.
-
-    Attributes:
-        rank: of the low-rank updates.
-        steps: of the optimizer.
-        batch: frames a step.
-        lr: of the low-rank updates.
-        token_lr: of the learned word.
-        seed: of the frames, noise and times drawn.
-    """
-
-    model_config = ConfigDict(frozen=True)
-
-    rank: int = Field(4, ge=1)
-    steps: int = Field(120, ge=1)
-    batch: int = Field(8, ge=1)
-    lr: float = Field(2e-3, gt=0)
-    token_lr: float = Field(1e-2, gt=0)
-    seed: int = 0
 
 
 @dataclass(frozen=True)
@@ -123,7 +101,9 @@ def without_identity(video: VideoModel) -> Iterator[None]:
             network.enable_adapters()
 
 
-def train_identity(video: VideoModel, frames: Frames, config: IdentityConfig) -> IdentityCurve:
+def train_identity(
+    video: VideoModel, frames: Frames, config: IdentityConfig, progress: Callable[[int], None] = lambda done: None
+) -> IdentityCurve:
     """Fine-tunes the prior on a subject: E ||(z1 - z0) - v(z_tau, tau; "a [v] person")||^2 over visible latents.
 
     Each frame is a video of one frame, so nothing of the order is learned. The adapter and the word stay in the model.
@@ -132,6 +112,7 @@ def train_identity(video: VideoModel, frames: Frames, config: IdentityConfig) ->
         video: without an adapter.
         frames: of the subject.
         config: knobs.
+        progress: told of the steps done.
 
     Raises:
         FloatingPointError: when the loss is not finite.
@@ -157,6 +138,7 @@ def train_identity(video: VideoModel, frames: Frames, config: IdentityConfig) ->
             loss.backward()
             optimizer.step()
             losses.append(float(loss.detach()))
+            progress(len(losses))
     with torch.no_grad():
         embedding_weight(video.components.text_encoder)[identity_token_id(video.components.tokenizer)] = word
     for parameter in updates:

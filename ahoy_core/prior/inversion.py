@@ -4,52 +4,15 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
-from pydantic import BaseModel, ConfigDict, Field, model_validator
 from torch import Tensor
 
 from ahoy_core.prior.conditioning import Context, hold
+from ahoy_core.prior.config import InversionConfig
 from ahoy_core.prior.identity import without_identity
 from ahoy_core.prior.solvers import Solver, sigma_grid, solve
 from ahoy_core.prior.video import VideoModel
-
-
-class InversionConfig(BaseModel):
-    """Knobs of RF-inversion.
-
-    Attributes:
-        mode: "steered" goes forward under the neutral prior without the identity adapter, so that only pose and
-            silhouette are encoded, and back with it; "paper" reads equation 4 to the letter: the adapted field both
-            ways, all the way to noise, nothing held.
-        solver: see `solvers`.
-        steps: each way.
-        tau_max: flow time at which the forward pass stops; 1 is pure noise.
-        gamma: pull of the forward pass towards drawn noise, 0 (none) to 1 (nothing but it, as SDEdit does).
-        eta: pull of the way back towards the coarse latents, 0 to 1.
-        eta_start: share of the way back, from noise, after which the pull begins.
-        eta_stop: share after which it ends.
-    """
-
-    model_config = ConfigDict(frozen=True)
-
-    mode: Literal["steered", "paper"] = "steered"
-    solver: Solver = "midpoint"
-    steps: int = Field(8, ge=1)
-    tau_max: float = Field(0.8, gt=0, le=1)
-    gamma: float = Field(0.5, ge=0, le=1)
-    eta: float = Field(0.0, ge=0, le=1)
-    eta_start: float = Field(0.0, ge=0, le=1)
-    eta_stop: float = Field(0.3, ge=0, le=1)
-
-    @model_validator(mode="after")
-    def _window(self) -> InversionConfig:
-        if self.eta_start > self.eta_stop:
-            raise ValueError(f"expected eta_start <= eta_stop, got {self.eta_start} > {self.eta_stop}")
-        if self.mode == "paper" and (self.tau_max, self.gamma, self.eta) != (1.0, 0.0, 0.0):
-            raise ValueError("expected tau_max 1, gamma 0 and eta 0 in paper mode, which knows no controller")
-        return self
 
 
 @dataclass(frozen=True)

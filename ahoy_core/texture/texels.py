@@ -126,3 +126,13 @@ def sample_atlas(atlas: FloatArray, uv: FloatArray) -> FloatArray:
     """
     height, width = atlas.shape[:2]
     return sample_image(atlas, np.stack([uv[:, 0] * width, (1 - uv[:, 1]) * height], axis=1))
+
+
+def face_coverage(coverage: FloatArray, texels: TexelMap, surface: Surface) -> FloatArray:
+    """Observed share [F] of each triangle, from the coverage [A,A] of an atlas, looked up at the triangle's middle.
+
+    Most triangles are smaller than a texel, so counting a triangle's own texels would find none.
+    """
+    seen = pad_charts((coverage > 0).astype(np.float32), texels.chart)
+    share: FloatArray = sample_atlas(seen, surface.uvs[surface.uv_faces].mean(axis=1)) * surface.textured
+    return share

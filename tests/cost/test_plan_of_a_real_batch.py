@@ -32,7 +32,8 @@ from storage_schema.artifacts import Blob
 from storage_schema.batches import read_batch
 from storage_schema.store import ArtifactStore
 from storage_schema.tables import Tables
-from tasks.stage import Run, Source, Stage, StageOutput, run_stage
+from tasks.running import run_stage
+from tasks.stage import Run, Source, Stage, StageOutput
 
 root, me, workers, flaky = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4])
 

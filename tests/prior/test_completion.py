@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from ahoy_core.prior.completion import Pictures, PriorConfig, composited, repaint
+from ahoy_core.prior.completion import Pictures, composited, repaint
+from ahoy_core.prior.config import InversionConfig, PriorConfig
 from ahoy_core.prior.corpus.dress import KINDS
 from ahoy_core.prior.evaluate import (
     Clips,
@@ -17,9 +18,8 @@ from ahoy_core.prior.evaluate import (
     region_weight,
     repair_methods,
     repaired,
-    round_trips,
 )
-from ahoy_core.prior.inversion import InversionConfig
+from ahoy_core.prior.round_trip import round_trips
 from ahoy_core.prior.video import VideoModel
 
 FRAMES, HEIGHT, WIDTH = 2, 64, 32

@@ -9,9 +9,9 @@ import torch
 from safetensors import safe_open
 
 from ahoy_core.prior.conditioning import Context
+from ahoy_core.prior.config import IdentityConfig
 from ahoy_core.prior.identity import (
     Frames,
-    IdentityConfig,
     add_identity,
     experts,
     has_identity,

@@ -14,7 +14,8 @@ from flows.pipeline import Outcome, process
 from storage_schema.artifacts import Blob
 from storage_schema.store import ArtifactStore
 from storage_schema.tables import Tables
-from tasks.stage import Run, Source, Stage, StageContext, StageOutput, StageRef, run_stage
+from tasks.running import run_stage
+from tasks.stage import Run, Source, Stage, StageContext, StageOutput, StageRef
 
 
 class Knobs(BaseModel):

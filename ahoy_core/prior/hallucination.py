@@ -1,0 +1,101 @@
+"""A planned sequence from the coarse avatar's render to supervision (paper, section 3.2; registration of DESIGN 4)."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import torch
+from torch import Tensor, nn
+
+from ahoy_core.avatar.avatar import Avatar
+from ahoy_core.avatar.hallucinated import Supervision
+from ahoy_core.avatar.render import render
+from ahoy_core.body.packaged import PackagedBody
+from ahoy_core.body.rotations import axis_angle_to_matrix
+from ahoy_core.conventions import GREY, Cameras
+from ahoy_core.prior.completion import Pictures, pose_context
+from ahoy_core.prior.sequences import PlannedSequence
+
+FACTOR: Final = 2
+"""Pixels of the stored cameras to one of the prior's: renders are compared after the same area filter."""
+_PERSON: Final = 0.06  # difference from grey above which a generated pixel shows somebody
+
+
+def fine_cameras(cameras: Cameras, factor: int = FACTOR) -> Cameras:
+    """The same cameras with `factor` times the pixels along each side."""
+    scale = torch.tensor([float(factor), float(factor), 1.0])[:, None]
+    size = factor * cameras.width, factor * cameras.height
+    return Cameras(cameras.viewmats, cameras.Ks * scale, *size, cameras.camera_model)
+
+
+@torch.no_grad()
+def coarse_pictures(avatar: Avatar, body: PackagedBody, sequence: PlannedSequence) -> Pictures:
+    """The coarse avatar in a planned sequence, with the observed share of every pixel.
+
+    Args:
+        avatar: the coarse avatar.
+        body: its body.
+        sequence: T frames.
+    """
+    cameras = fine_cameras(sequence.cameras)
+    frames, masks, coverage = [], [], []
+    observed = avatar.observed[:, None].expand(-1, 3).contiguous()
+    for t in range(len(sequence.pose)):
+        posed = avatar.pose(body, sequence.pose[t], sequence.transl[t])
+        shown = render(posed.means, posed.covars, posed.opacities, posed.colors, cameras[t])
+        covered = render(posed.means, posed.covars, posed.opacities, observed, cameras[t], background=0.0)
+        frames.append(shown.images[0])
+        masks.append(shown.alphas[0])
+        coverage.append(covered.images[0, :1])
+    return Pictures(*(_reduced(torch.stack(values)) for values in (frames, masks, coverage)))
+
+
+def _reduced(pictures: Tensor) -> Tensor:
+    return nn.functional.avg_pool2d(pictures.clamp(0, 1), FACTOR)
+
+
+def sequence_context(body: PackagedBody, betas: Tensor, sequence: PlannedSequence) -> tuple[Tensor, Tensor]:
+    """Body maps [1,T,7,H/4,W/4] and azimuths [1,T] of a planned sequence of a shape `betas` [S]."""
+    count = len(sequence.pose)
+    with torch.no_grad():
+        vertices = body(sequence.pose, betas[None].expand(count, -1), sequence.transl).vertices
+    return pose_context(body, vertices, axis_angle_to_matrix(sequence.pose[:, 0]), sequence.cameras)
+
+
+def silhouette_iou(made: Tensor, pictures: Pictures) -> float:
+    """Intersection over union of the generated person and the coarse one, both found against the grey.
+
+    Args:
+        made: [T,3,H,W] as the prior made them.
+        pictures: what it was given.
+    """
+    ours, theirs = ((frames - GREY).abs().amax(1) > _PERSON for frames in (made, pictures.frames))
+    return float((ours & theirs).sum() / (ours | theirs).sum().clamp(min=1))
+
+
+def rms_where(made: Tensor, truth: Tensor, weight: Tensor) -> float:
+    """Root mean square colour difference of pictures [T,3,H,W] under weights [T,1,H,W]; NaN where nothing counts."""
+    area = 3 * weight.sum()
+    return float((((made - truth).square() * weight).sum() / area).sqrt()) if float(area) > 0 else float("nan")
+
+
+def as_supervision(sequence: PlannedSequence, frames: Tensor, pictures: Pictures) -> Supervision:
+    """A hallucinated sequence as the full avatar takes it, registered by the motion that rendered its coarse input.
+
+    Args:
+        sequence: motion pose and cameras.
+        frames: [T,3,H,W] hallucinated, observed pixels pasted over.
+        pictures: the coarse render, for coverage and alpha.
+    """
+    return Supervision(
+        name=sequence.name,
+        kind=sequence.kind,
+        frames=frames,
+        coverage=torch.minimum(pictures.coverage, pictures.mask)[:, 0],
+        map_pose=sequence.map_pose,
+        pose=sequence.pose,
+        transl=sequence.transl,
+        cameras=fine_cameras(sequence.cameras),
+        alphas=pictures.mask[:, 0],
+        keeps_head=True,  # no face views come from the prior: nothing else shows the head from behind
+    )

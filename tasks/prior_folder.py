@@ -1,0 +1,69 @@
+"""Which prior a run asks: the one that ships with the package, a folder of the user's, or none."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from functools import cache
+from importlib import resources
+from importlib.util import find_spec
+from pathlib import Path
+
+from ahoy_core.body.load import PACKAGED
+from tasks.role import Role
+
+NONE = "none"
+_INDEX = "model_index.json"
+_NEEDS = ("diffusers", "peft", "transformers")
+_EMBEDDED = "FrameAutoencoder"
+
+
+def prior_folder(source: str) -> Path:
+    """Where the prior that `Settings.prior` names lies, whether or not it is there."""
+    if source == PACKAGED:
+        return Path(str(resources.files("ahoy_core.assets").joinpath("prior")))
+    return Path(source).expanduser()
+
+
+def no_prior(source: str, body: str) -> str:
+    """Why a run cannot ask a prior; empty where it can.
+
+    Args:
+        source: `Settings.prior`.
+        body: `Settings.body`.
+
+    Raises:
+        FileNotFoundError: the user named a folder that holds no prior.
+    """
+    if source == NONE:
+        return "switched off (prior=none)"
+    index = prior_folder(source) / _INDEX
+    if not index.is_file():
+        if source == PACKAGED:
+            return "no trained prior ships with this version; name one with prior=FOLDER (docs/prior.md)"
+        raise FileNotFoundError(f"expected a prior with {_INDEX} in {source!r}, got none; correct the knob `prior`")
+    if missing := [name for name in _NEEDS if find_spec(name) is None]:
+        return f"needs {', '.join(missing)}: pip install 'ahoy-avatars[prior]'"
+    if json.loads(index.read_text(encoding="utf-8")).get("vae", ["", ""])[1] != _EMBEDDED:
+        return "this prior reads no bodies (Wan as published): the library runs it, the stages do not yet"
+    if body != PACKAGED:
+        return "the prior knows the packaged body alone, and this run has another"
+    return ""
+
+
+def prior_role(source: str) -> Role:
+    """The video model of a run, known by the contents of its weights and configurations."""
+    folder = prior_folder(source)
+    files = sorted(path for kind in ("*.safetensors", "*.json") for path in folder.rglob(kind))
+    name = "embedded prior" if source == PACKAGED else f"{folder.name} (your folder)"
+    licence = "Apache-2.0" if source == PACKAGED else "that of its folder"
+    return Role(name, licence, _digest(tuple((path, path.stat().st_mtime_ns) for path in files)))
+
+
+@cache
+def _digest(versions: tuple[tuple[Path, int], ...]) -> str:
+    digest = hashlib.sha256()
+    for path, _ in versions:
+        with path.open("rb") as handle:
+            digest.update(hashlib.file_digest(handle, "sha256").digest())
+    return digest.hexdigest()
