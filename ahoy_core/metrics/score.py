@@ -66,7 +66,8 @@ def score_picture(made: Made, truth: Truth, pixels: Pixels, perceptual: Perceptu
     """Score one picture.
 
     Both pictures are laid over grey 0.5; where the truth is not known both show grey. PSNR is over the known pixels of
-    a region, SSIM the mean of its map over them, the perceptual distance that of the boxes of person and head, IoU that of the alphas at 0.5.
+    a region, SSIM the mean of its map over them, the perceptual distance that of the boxes of person and head, IoU
+    that of the alphas at 0.5.
 
     Args:
         made: The picture, of the truth's size.
