@@ -8,11 +8,17 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ahoy_core.body.convert import Skeleton, SkeletonPose, body_skeleton, convert_pose, joint_map
+from ahoy_core.body.convert import (
+    Skeleton,
+    SkeletonPose,
+    body_skeleton,
+    convert_pose,
+    joint_map,
+    skeleton_joints,
+)
 from ahoy_core.body.model import BodyModel
 from ahoy_core.body.packaged import load_packaged_body
 from ahoy_core.body.rotations import matrix_to_axis_angle
@@ -21,6 +27,10 @@ from ahoy_core.conventions import Cameras
 
 Moment = Literal["view", "pose", "input"]
 """What a true picture shows: a moment of the input, a pose that the input never shows, or the input itself."""
+
+_SIDED = ("upperleg01", "lowerleg01", "foot", "upperarm01", "lowerarm01", "wrist")
+ANCHORS = ("neck01", "head", *(f"{name}.{side}" for name in _SIDED for side in "LR"))
+"""Joints of the packaged body that a driven body of another shape is laid onto: each limb's, trunk and head."""
 
 
 @dataclass(frozen=True)
@@ -122,7 +132,11 @@ class Capture:
 
 
 def drive(truth: BodyTruth, body: BodyModel, betas: Tensor) -> tuple[Tensor, Tensor]:
-    """The true motion on a body of its own shape: world rotations carry over, and the root joint stands where it did.
+    """The true motion on a body of its own shape: world rotations carry over, and the joints stand where they did.
+
+    Where the shape differs, not all joints can. The root alone would be a poor anchor (in the packaged body it lies at
+    the back, so that a belly too large moves the legs forward by centimetres): the place is that of the least squared
+    distance between its `ANCHORS` and the true ones. It depends on the truth and the shape, never on a picture.
 
     Args:
         truth: T true poses.
@@ -133,16 +147,22 @@ def drive(truth: BodyTruth, body: BodyModel, betas: Tensor) -> tuple[Tensor, Ten
         pose [T,J,3] axis-angle and transl [T,3] metres, in the capture's world.
     """
     target = body_skeleton(body, betas.float())
-    joints = joint_map(target.joint_names, truth.skeleton.joint_names)
-    moved = convert_pose(truth.skeleton, target, truth.pose, joints, is_limb)
-    transl = moved.root - target.rest_joints[0].to(moved.root)
+    moved = _converted(truth, target)
+    packaged = load_packaged_body()
+    names = joint_map(body.joint_names, packaged.joint_names) or {name: name for name in body.joint_names}
+    pairs = [(mine, theirs) for mine, theirs in names.items() if theirs in ANCHORS]
+    mine = skeleton_joints(target, moved)[:, [body.joint_names.index(name) for name, _ in pairs]]
+    true = true_joints(truth)[:, [packaged.joint_names.index(name) for _, name in pairs]]
+    transl = moved.root - target.rest_joints[0].to(moved.root) + (true.to(mine) - mine).mean(1)
     return matrix_to_axis_angle(moved.rotations).float(), transl.float()
 
 
-def true_joints(truth: BodyTruth, body: BodyModel | None = None) -> Tensor:
+def true_joints(truth: BodyTruth) -> Tensor:
     """Joints [T,J,3] of the packaged body in its true shape (the average where that is not known), metres, world."""
-    body = body or load_packaged_body()
-    betas = body.default_betas if truth.betas is None else truth.betas
-    pose, transl = drive(truth, body, betas)
-    with torch.no_grad():
-        return body(pose, betas[None].float(), transl).joints
+    skeleton = body_skeleton(load_packaged_body(), None if truth.betas is None else truth.betas.float())
+    return skeleton_joints(skeleton, _converted(truth, skeleton)).float()
+
+
+def _converted(truth: BodyTruth, target: Skeleton) -> SkeletonPose:
+    joints = joint_map(target.joint_names, truth.skeleton.joint_names)
+    return convert_pose(truth.skeleton, target, truth.pose, joints, is_limb)

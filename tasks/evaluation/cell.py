@@ -27,7 +27,7 @@ from tasks.evaluation.truths import Shot, Truths
 from tasks.roles import packaged_body, perceptual_network, perceptual_role
 from tasks.stage import Role, Stage, StageContext, StageOutput
 
-VERSION = 1
+VERSION = 2
 COLUMNS = (
     *("capture", "config", "protocol", "region", "camera", "frame"),
     *("psnr", "ssim", "perceptual", "perceptual_name", "iou", "protocol_id", "input_setting"),

@@ -131,6 +131,6 @@ def _bars(axes: Axes, found: Mapping[str, Spread], title: str) -> None:
             axes.errorbar(place, mean, span, color="k", capsize=4)
         else:
             axes.plot([place] * len(values), values, "k.", ms=6)
-    low = min(min(values) for _, _, values in found.values())
-    axes.set(title=title, ylabel="PSNR in the mask box, dB", ylim=(max(0.0, low - 2), None))
+        axes.annotate(f"{mean:.1f}", (place, 0), (0, 4), textcoords="offset points", ha="center", color="w", size=8)
+    axes.set(title=title, ylabel="PSNR in the mask box, dB")  # from 0: a bar's length must mean something
     axes.set_xticks(range(len(names)), names, rotation=60, ha="right", fontsize=8)

@@ -124,11 +124,12 @@ def reduced(picture: TruePicture, size: int) -> TruePicture:
         small = cv2.resize(array, (wide, tall), interpolation=cv2.INTER_AREA)
         return torch.from_numpy(small.reshape(tall, wide, -1)).permute(2, 0, 1)
 
-    stacked = torch.cat([picture.rgb * picture.alpha, picture.alpha[None], picture.known[None].float()])
-    small = smaller(stacked)
+    # OpenCV's area filter takes at most four channels.
+    small = smaller(torch.cat([picture.rgb * picture.alpha, picture.alpha[None]]))
+    known = smaller(picture.known[None].float())[0]
     alpha = small[3]
     rgb = torch.where(alpha > 0, small[:3] / alpha.clamp(min=1e-6), torch.full_like(small[:3], GREY)).clamp(0, 1)
-    return TruePicture(rgb, alpha, small[4] > 0.999)
+    return TruePicture(rgb, alpha, known > 0.999)  # a pixel that is known in part is not
 
 
 def _reduced_size(height: int, width: int, size: int) -> tuple[int, int]:
