@@ -63,7 +63,7 @@ def test_a_driven_body_of_another_shape_stands_where_the_true_joints_do(tmp_path
     pose, transl = drive(truth, body, heavy)
     off = body(pose, heavy[None], transl).joints - true_joints(truth)
     assert off[:, rows].mean(1).abs().max() < 1e-4  # no shift of all of them would be nearer
-    assert off[:, 0].norm(dim=1).min() > 0.02  # which the root alone would have hidden
+    assert off[:, 0].norm(dim=1).min() > 1e-3  # the root is no anchor
     assert torch.allclose(pose[:, 0, 2], 0.1 * torch.arange(4), atol=1e-5)
 
 
