@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, get_args
 
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
@@ -27,8 +27,9 @@ from flows.pipeline import Outcome, call_directly, process
 from storage_schema.store import ArtifactStore
 from storage_schema.tables import Tables
 from tasks.evaluation.cell import MakeRenderer, avatar_renderer, evaluate_stage, reference_renderer
-from tasks.evaluation.config import EvaluateConfig
+from tasks.evaluation.config import EvaluateConfig, InputSetting
 from tasks.evaluation.fitted import Fitted
+from tasks.evaluation.folders import folder_renderer, renders_source
 from tasks.evaluation.inputs import known_camera, truth_source, video_source
 from tasks.evaluation.results import Cell, write_results
 from tasks.evaluation.truths import Truths
@@ -39,6 +40,33 @@ from tasks.stage import Observer, Run, Source, Stage, StageRef, run_stage
 
 BATCH = "evaluate"
 _UNSAFE = re.compile(r"[^A-Za-z0-9._-]+")
+
+
+class OtherSystem(NamedTuple):
+    """Renders that another system made: what it is called, where they lie, what it was given."""
+
+    name: str
+    folder: Path
+    input_setting: str
+
+    @classmethod
+    def of(cls, text: str) -> OtherSystem:
+        """Read NAME=FOLDER or NAME=FOLDER@INPUT_SETTING.
+
+        Raises:
+            ValueError: it has another form, no such folder or setting, or the name of a configuration.
+        """
+        name, _, rest = text.partition("=")
+        folder, _, setting = rest.partition("@")
+        settings = get_args(InputSetting)
+        if not name or not Path(folder).is_dir() or (setting or settings[0]) not in settings:
+            raise ValueError(
+                f"expected NAME=FOLDER or NAME=FOLDER@SETTING with a folder that exists and a setting among "
+                f"{', '.join(settings)}, got {text!r}"
+            )
+        if name in ABLATIONS or name in REFERENCES:
+            raise ValueError(f"expected another name than that of a configuration, got {name!r}")
+        return cls(name, Path(folder), setting or settings[0])
 
 
 class EvaluateRequest(BaseModel):
@@ -59,6 +87,7 @@ class EvaluateRequest(BaseModel):
     give_camera: bool = Field(True, description="tell the method the input's camera, where it is known")
     protocols: tuple[str, ...] = Field(tuple(PROTOCOLS), description="names of protocols")
     size: int = Field(256, ge=32, le=4096, description="longest side of what is compared, pixels")
+    renders: tuple[str, ...] = Field((), description="other systems: NAME=FOLDER or NAME=FOLDER@INPUT_SETTING")
     withhold: int = Field(8, ge=2, description="of a plain video, every n-th frame is withheld")
 
     @field_validator("ablate")
@@ -67,6 +96,13 @@ class EvaluateRequest(BaseModel):
         if unknown := [name for name in names if name not in ABLATIONS]:
             raise ValueError(f"expected configurations among {', '.join(ABLATIONS)}, got {', '.join(unknown)}")
         return tuple(dict.fromkeys(names))
+
+    @field_validator("renders")
+    @classmethod
+    def _parsed(cls, texts: tuple[str, ...]) -> tuple[str, ...]:
+        for text in texts:
+            OtherSystem.of(text)
+        return texts
 
     def captures(self) -> list[Capture]:
         """The captures that were asked for.
@@ -183,6 +219,21 @@ def reference_cell(subject: Subject, name: str) -> Cell:
     return Cell(subject.capture.name, name, ref)
 
 
+def other_cell(subject: Subject, name: str) -> Cell:
+    """Another system's renders of one capture."""
+    other = next(one for text in subject.request.renders if (one := OtherSystem.of(text)).name == name)
+    outcome, perceived = stages_up_to(subject, "full", "perceive", subject.run())
+    stage = evaluate_stage(subject.capture, subject.every, ("renders",), folder_renderer)
+    inputs: dict[str, StageRef | Source] = {
+        "capture": subject.truth,
+        "ingest": outcome.refs["ingest"],
+        "perceive": perceived,
+        "renders": renders_source(other.folder, subject.capture.name),
+    }
+    config = subject.config(name, input_setting=other.input_setting)
+    return Cell(subject.capture.name, name, run_stage(stage, config, inputs, subject.run()))
+
+
 def _facts(store: ArtifactStore, outcome: Outcome) -> dict[str, Any]:
     manifests = [store.lookup(ref.key, stage=ref.stage, verify=False) for ref in outcome.refs.values()]
     roles = {role for manifest in manifests if manifest for role in manifest.roles}
@@ -231,7 +282,9 @@ def evaluate(
     subjects = [Subject(request, capture, store, observer) for capture in request.captures()]
     cells: list[Cell] = []
     for subject in subjects:
-        jobs = [(name, avatar_cell) for name in request.ablate] + [(name, reference_cell) for name in REFERENCES]
+        jobs: list[tuple[str, MakeCell]] = [(name, avatar_cell) for name in request.ablate]
+        jobs += [(OtherSystem.of(text).name, other_cell) for text in request.renders]
+        jobs += [(name, reference_cell) for name in REFERENCES]
         for name, make in jobs:
             cells.append(_guarded(make, subject, name, watch))
             told(f"{subject.capture.name}, {name}: {cells[-1].error or cells[-1].ref.state}")  # type: ignore[union-attr]

@@ -25,6 +25,9 @@ def evaluate(
     input_camera: Annotated[str, typer.Option(help="camera that made the input, where that is open")] = "",
     truth_body: Annotated[str | None, typer.Option(help="body file that true SMPL parameters belong to")] = None,
     camera: Annotated[bool, typer.Option(help="tell the method the input's camera")] = True,
+    renders: Annotated[
+        list[str] | None, typer.Option(help="another system's renders, NAME=FOLDER[@INPUT_SETTING]; repeatable")
+    ] = None,
     withhold: Annotated[int, typer.Option(help="of a plain video, every n-th frame is withheld")] = 8,
     store: Annotated[str | None, typer.Option(help="URL of the artifact store  [default: OUT/store]")] = None,
     set_: Annotated[list[str] | None, typer.Option("--set", help="a knob, as STAGE.KNOB=VALUE; repeatable")] = None,
@@ -51,6 +54,7 @@ def evaluate(
         "ablate": _names(ablate),
         "only": _names(only),
         "overrides": tuple(set_ or ()),
+        "renders": tuple(renders or ()),
         **({"protocols": _names(protocols)} if protocols else {}),
     }
     try:

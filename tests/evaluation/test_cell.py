@@ -13,14 +13,16 @@ import pytest
 import torch
 
 from ahoy_core.captures.capture import Capture
+from ahoy_core.formats.images import to_uint8, write_png
 from ahoy_core.metrics.protocol import PROTOCOLS
 from ahoy_core.metrics.score import Made
 from tasks.evaluation import cell as cell_module
 from tasks.evaluation.cell import COLUMNS, _run, as_stored
 from tasks.evaluation.config import EvaluateConfig
 from tasks.evaluation.fitted import Fitted
+from tasks.evaluation.folders import FolderRenderer, renders_source
 from tasks.evaluation.renderers import AvatarRenderer, Renderer, reference
-from tasks.evaluation.truths import Truths
+from tasks.evaluation.truths import Shot, Truths
 from tasks.evaluation.withhold import withheld
 from tasks.stage import StageContext
 from tests.evaluation import people
@@ -172,3 +174,35 @@ def test_the_perceptual_net_is_named_in_row_and_id(
     assert by_region["box"]["perceptual"] > 0 and by_region["box"]["perceptual_name"] == "L1-net"
     assert by_region["mask"]["perceptual"] is None and by_region["mask"]["perceptual_name"] is None
     assert "perceptual=L1-net, input [0,1]" in by_region["box"]["protocol_id"]
+
+
+def test_renders_of_another_system_score_as_the_same_pictures_of_ours(
+    made: tuple[Capture, Fitted], rows: list[dict], tmp_path: Path
+) -> None:
+    capture, fitted = made
+    home, renderer = tmp_path / "other" / "made", _avatar(capture, fitted)
+    truths = Truths(capture, fitted, people.SIZE, None)
+
+    for view in truths.views("novel-view-gt")[0]:
+        shot = truths.shot("novel-view-gt", view)
+        assert shot is not None
+        picture = renderer(shot)
+        assert picture.alpha is not None
+        straight = (picture.rgb - 0.5 * (1 - picture.alpha)) / picture.alpha.clamp(min=1e-3)
+        path = home / "novel-view-gt" / f"{view.camera}_{view.frame:03d}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_png(path, to_uint8(torch.cat([straight.clamp(0, 1), picture.alpha[None]])))
+    (home / "novel-view-gt" / "side_003.png").unlink()
+    found = _rows(capture, fitted, FolderRenderer(home), tmp_path, protocols=("novel-view-gt",))
+    assert {row["frame"] for row in found} == {0} and _mean(found, "novel-view-gt") > 40  # 8-bit straight alpha
+    assert "side, frame 3: no picture was given" in (tmp_path / "cell.json").read_text()
+    assert (
+        renders_source(tmp_path / "other", "made").content_hash
+        == renders_source(tmp_path / "other", "made").content_hash
+    )
+    with pytest.raises(ValueError, match="got none"):
+        renders_source(tmp_path / "other", "nobody")
+    write_png(home / "novel-view-gt" / "side_000.png", np.zeros((8, 8, 3), np.uint8))
+    assert renders_source(tmp_path / "other", "made").content_hash != before
+    with pytest.raises(ValueError, match="render at it"):
+        _rows(capture, fitted, FolderRenderer(home), tmp_path, protocols=("novel-view-gt",))
