@@ -31,7 +31,7 @@ from tasks.evaluation.config import EvaluateConfig, InputSetting
 from tasks.evaluation.fitted import Fitted
 from tasks.evaluation.folders import folder_renderer, renders_source
 from tasks.evaluation.inputs import known_camera, truth_source, video_source
-from tasks.evaluation.results import Cell, write_results
+from tasks.evaluation.results import Cell, read_metrics, write_results
 from tasks.evaluation.truths import Truths
 from tasks.evaluation.withhold import WITHHOLD, WithholdConfig
 from tasks.presets import PRESETS
@@ -88,6 +88,7 @@ class EvaluateRequest(BaseModel):
     protocols: tuple[str, ...] = Field(tuple(PROTOCOLS), description="names of protocols")
     size: int = Field(256, ge=32, le=4096, description="longest side of what is compared, pixels")
     renders: tuple[str, ...] = Field((), description="other systems: NAME=FOLDER or NAME=FOLDER@INPUT_SETTING")
+    beside: tuple[str, ...] = Field((), description="metrics.parquet of earlier evaluations, for the same tables")
     withhold: int = Field(8, ge=2, description="of a plain video, every n-th frame is withheld")
 
     @field_validator("ablate")
@@ -291,7 +292,8 @@ def evaluate(
     if not any(cell.ref for cell in cells):
         raise ValueError(f"nothing could be scored; the first reason: {cells[0].error if cells else 'no cells'}")
     truths = {subject.capture.name: _truths(subject) for subject in subjects}
-    return write_results(store, cells, truths, Path(request.out), _heading(request, subjects)), cells
+    others = [row for path in request.beside for row in read_metrics(Path(path))]
+    return write_results(store, cells, truths, Path(request.out), _heading(request, subjects), others), cells
 
 
 def _guarded(make: MakeCell, subject: Subject, name: str, watch: Watch) -> Cell:

@@ -28,6 +28,9 @@ def evaluate(
     renders: Annotated[
         list[str] | None, typer.Option(help="another system's renders, NAME=FOLDER[@INPUT_SETTING]; repeatable")
     ] = None,
+    beside: Annotated[
+        list[str] | None, typer.Option("--with", help="metrics.parquet of another evaluation, for the same tables")
+    ] = None,
     withhold: Annotated[int, typer.Option(help="of a plain video, every n-th frame is withheld")] = 8,
     store: Annotated[str | None, typer.Option(help="URL of the artifact store  [default: OUT/store]")] = None,
     set_: Annotated[list[str] | None, typer.Option("--set", help="a knob, as STAGE.KNOB=VALUE; repeatable")] = None,
@@ -55,6 +58,7 @@ def evaluate(
         "only": _names(only),
         "overrides": tuple(set_ or ()),
         "renders": tuple(renders or ()),
+        "beside": tuple(beside or ()),
         **({"protocols": _names(protocols)} if protocols else {}),
     }
     try:

@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 
 from ahoy_core.captures.capture import View
 from ahoy_core.formats.npz import load_npz
 from ahoy_core.metrics.score import REFERENCES
 from storage_schema.store import ArtifactStore
-from tasks.evaluation.cell import to_table
+from tasks.evaluation.cell import COLUMNS, to_table
 from tasks.evaluation.pictures import Picture, draw_chart, draw_pictures
 from tasks.evaluation.tables import tables
 from tasks.evaluation.truths import Truths
@@ -46,6 +47,22 @@ class Cell:
 def read_rows(store: ArtifactStore, cells: Sequence[Cell]) -> list[dict[str, Any]]:
     """The rows of all finished cells, cell after cell."""
     return [row for cell in cells if cell.ref for row in pq.read_table(_folder(store, cell) / METRICS).to_pylist()]
+
+
+def read_metrics(path: Path) -> list[dict[str, Any]]:
+    """Rows that an evaluation left.
+
+    Raises:
+        ValueError: no such file, or another table.
+    """
+    try:
+        table = pq.read_table(path)
+    except (OSError, pa.ArrowException) as error:
+        raise ValueError(f"expected the metrics.parquet of an evaluation, got {path}: {error}") from error
+    if missing := sorted(set(COLUMNS) - set(table.column_names)):
+        raise ValueError(f"expected the columns of metrics.parquet in {path}, got none of {missing}")
+    rows: list[dict[str, Any]] = table.to_pylist()
+    return rows
 
 
 def read_pictures(store: ArtifactStore, cell: Cell) -> tuple[list[Picture], list[str]]:

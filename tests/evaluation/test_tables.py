@@ -8,7 +8,7 @@ import pytest
 
 from storage_schema.store import ArtifactStore
 from tasks.evaluation.pictures import draw_chart
-from tasks.evaluation.results import Cell, remarks, write_results
+from tasks.evaluation.results import Cell, read_metrics, remarks, write_results
 from tasks.evaluation.tables import differences, one_table, tables
 from tasks.stage import Bill, StageRef
 
@@ -82,4 +82,7 @@ def test_rows_of_an_earlier_evaluation_under_another_protocol_are_refused(
     with pytest.raises(ValueError, match="never put into one table"):
         write_results(store, [], {}, tmp_path / "out", [], other)
     paths = write_results(store, [], {}, tmp_path / "out", ["# Title"], [_row("c0", "other system", 25.0)])
+    assert read_metrics(paths["metrics.parquet"])[-1]["config"] == "other system"
+    with pytest.raises(ValueError, match=r"expected the metrics\.parquet"):
+        read_metrics(paths["table.md"])
     assert "| other system | video | 25.00 |" in paths["table.md"].read_text()
