@@ -91,7 +91,8 @@ class Truths:
             picture, camera = self._input(view), self._fitted_camera()
         else:
             picture, camera = self.capture.picture(view), self.capture.cameras[view.camera]
-        picture, camera = reduced(picture, self.size), _scaled(camera, picture, self.size)
+        picture = reduced(picture, self.size)
+        camera = _scaled(camera, *picture.alpha.shape)
         if int((picture.alpha > 0.5).sum()) == 0:
             return None
         if view.moment == "input" or self.surface is None:
@@ -137,8 +138,7 @@ def _reduced_size(height: int, width: int, size: int) -> tuple[int, int]:
     return max(1, round(height * factor)), max(1, round(width * factor))
 
 
-def _scaled(camera: Cameras, picture: TruePicture, size: int) -> Cameras:
-    """The camera for the scored size: `picture` is the reduced one."""
-    height, width = picture.alpha.shape
+def _scaled(camera: Cameras, height: int, width: int) -> Cameras:
+    """The camera for a picture of another size."""
     scale = torch.tensor([width / camera.width, height / camera.height, 1.0])
     return Cameras(camera.viewmats, camera.Ks * scale[:, None], width, height, camera.camera_model)
