@@ -37,8 +37,9 @@ def evaluate(
     prefect: Annotated[bool, typer.Option("--prefect", help="as a Prefect flow, watched at PREFECT_API_URL")] = False,
 ) -> None:
     """Score avatars against the truth; finished cells are found in the store and not made again."""
-    from flows.evaluate import EvaluateRequest, evaluate_flow
     from flows.evaluate import evaluate as run_evaluation
+    from flows.evaluate import evaluate_flow
+    from flows.evaluate_request import EvaluateRequest
     from flows.terminal import TerminalObserver
     from tasks.evaluation.results import remarks
 
