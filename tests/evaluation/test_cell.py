@@ -82,7 +82,9 @@ def test_rows_have_the_columns_and_ids_differ_by_protocol_region_and_size(
     assert len(set(ids.values())) == len(ids)
     smaller = _rows(*made, _avatar(*made), tmp_path, size=48, protocols=("novel-view-gt",))
     assert not {row["protocol_id"] for row in smaller} & set(ids.values())
-    assert all("size=48x48" in row["protocol_id"] and row["psnr"] > 35 for row in smaller if row["region"] == "box")
+    box = [row for row in smaller if row["region"] == "box"]
+    # Truth filtered down against a render of that size: not equal, but a camera left unscaled would miss the person.
+    assert box and all("size=48x48" in row["protocol_id"] and row["psnr"] > 20 for row in box)
 
 
 def test_a_wrong_avatar_scores_less_in_the_region_where_it_is_wrong(
