@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import av
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -17,6 +16,7 @@ from ahoy_core.captures.capture import BodyTruth, Capture, Moment, TruePicture, 
 from ahoy_core.captures.files import camera, read_json, read_mask, read_picture, unit
 from ahoy_core.conventions import Cameras
 from ahoy_core.formats.npz import load_npz
+from ahoy_core.formats.video import read_frames
 
 INPUT = "front"
 _FOLDERS: dict[Moment, str] = {"view": "gt", "pose": "novel"}
@@ -56,7 +56,7 @@ def read_ours(folder: Path) -> Capture:
 
     def frames() -> list[NDArray[np.uint8]]:
         if not found:
-            found.extend(_decoded(folder / "front.mp4"))
+            found.extend(frame.image for frame in read_frames(folder / "front.mp4"))
         return found
 
     def picture(view: View) -> TruePicture:
@@ -96,8 +96,3 @@ def read_motion(path: Path) -> BodyTruth:
     pose = SkeletonPose(nearest_rotation(local[..., :3, :3]), local[:, 0, :3, 3])
     betas = torch.tensor([float(phenotype[name]) for name in body.beta_names])
     return BodyTruth(rig_skeleton(body), pose, tuple(range(len(local))), betas)
-
-
-def _decoded(path: Path) -> list[NDArray[np.uint8]]:
-    with av.open(str(path)) as video:
-        return [frame.to_ndarray(format="rgb24").astype(np.uint8, copy=False) for frame in video.decode(video=0)]
