@@ -13,7 +13,18 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from flows import batch_cli, export_cli, models_cli, plan_cli, prior_cli, render_cli, server_cli, store_cli, view_cli
+from flows import (
+    batch_cli,
+    evaluate_cli,
+    export_cli,
+    models_cli,
+    plan_cli,
+    prior_cli,
+    render_cli,
+    server_cli,
+    store_cli,
+    view_cli,
+)
 from storage_schema.secrets import RedactSecrets
 
 if TYPE_CHECKING:
@@ -26,7 +37,7 @@ app.add_typer(store_cli.app, name="store")
 COMMANDS = (
     *(batch_cli.submit, batch_cli.status, batch_cli.rerun, batch_cli.cancel, batch_cli.logs, plan_cli.plan),
     *(server_cli.server, server_cli.worker, server_cli.install),
-    *(render_cli.render, export_cli.export, view_cli.view),
+    *(render_cli.render, export_cli.export, view_cli.view, evaluate_cli.evaluate),
 )
 for command in COMMANDS:
     app.command()(command)

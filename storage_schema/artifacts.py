@@ -28,6 +28,38 @@ class Blob:
     optional: bool = False
 
 
+_PERCEIVED: tuple[Blob, ...] = (
+    Blob(
+        "body.npz",
+        {
+            "pose": Array("float32", ("T", "J", 3)),  # axis-angle, radians; joint 0 is the root in the world
+            "transl": Array("float32", ("T", 3)),  # metres, world
+            "betas": Array("float32", ("S",)),  # one shape for the video
+            "expression": Array("float32", ("T", "E")),
+            "expression_confidence": Array("float32", ("T",)),
+            "joint_confidence": Array("float32", ("T", "J")),  # [0,1]
+            "frame_confidence": Array("float32", ("T",)),  # [0,1]
+            "used": Array("bool", ("T",)),  # a person was found and fitted in this frame
+            "viewmat": Array("float32", (4, 4)),
+            "K": Array("float32", (3, 3)),
+            "landmarks": Array("float32", ("T", 33, 3)),  # x, y in pixels, visibility in [0,1]
+        },
+    ),
+    Blob(
+        "masks.npz",
+        {
+            "visible": Array("uint8", ("T", "H", "W")),  # alpha of the visible part of the subject, 0..255
+            "amodal": Array("uint8", ("T", "H", "W")),  # the whole person, hidden parts included
+            "head": Array("uint8", ("T", "H", "W")),  # alpha of the visible head with its hair
+            "occluded": Array("float32", ("T",)),  # share of the body's silhouette that is not visible
+            "box": Array("float32", ("T", 4)),  # x0, y0, x1, y1 of the visible mask, pixels; zeros where unused
+        },
+    ),
+    Blob("overlay.png"),  # body, landmarks and mask drawn on frames
+    Blob("fit.json"),  # field of view and where it came from, final residuals, what was skipped and why
+)
+"""What is known of the subject in every frame."""
+
 _ATLAS: Mapping[str, Array] = {
     "observed_rgb": Array("uint8", ("A", "A", 3)),  # first write wins; 0 where never seen
     "coverage": Array("float32", ("A", "A")),  # [0,1], 0 where never seen
@@ -57,36 +89,8 @@ ARTIFACTS: Mapping[str, tuple[Blob, ...]] = {
         ),
         Blob("probe.json"),
     ),
-    "perceive": (
-        Blob(
-            "body.npz",
-            {
-                "pose": Array("float32", ("T", "J", 3)),  # axis-angle, radians; joint 0 is the root in the world
-                "transl": Array("float32", ("T", 3)),  # metres, world
-                "betas": Array("float32", ("S",)),  # one shape for the video
-                "expression": Array("float32", ("T", "E")),
-                "expression_confidence": Array("float32", ("T",)),
-                "joint_confidence": Array("float32", ("T", "J")),  # [0,1]
-                "frame_confidence": Array("float32", ("T",)),  # [0,1]
-                "used": Array("bool", ("T",)),  # a person was found and fitted in this frame
-                "viewmat": Array("float32", (4, 4)),
-                "K": Array("float32", (3, 3)),
-                "landmarks": Array("float32", ("T", 33, 3)),  # x, y in pixels, visibility in [0,1]
-            },
-        ),
-        Blob(
-            "masks.npz",
-            {
-                "visible": Array("uint8", ("T", "H", "W")),  # alpha of the visible part of the subject, 0..255
-                "amodal": Array("uint8", ("T", "H", "W")),  # the whole person, hidden parts included
-                "head": Array("uint8", ("T", "H", "W")),  # alpha of the visible head with its hair
-                "occluded": Array("float32", ("T",)),  # share of the body's silhouette that is not visible
-                "box": Array("float32", ("T", 4)),  # x0, y0, x1, y1 of the visible mask, pixels; zeros where unused
-            },
-        ),
-        Blob("overlay.png"),  # body, landmarks and mask drawn on frames
-        Blob("fit.json"),  # field of view and where it came from, final residuals, what was skipped and why
-    ),
+    "perceive": _PERCEIVED,
+    "withhold": _PERCEIVED,  # the same, with frames that nothing may be learned from
     "subjects": (
         Blob("subjects.png"),  # a row of pictures for each person
         Blob("subjects.json"),  # number, frames, shots, size of each; which are worth an avatar
@@ -165,4 +169,15 @@ ARTIFACTS: Mapping[str, tuple[Blob, ...]] = {
         Blob("animate.json"),
     ),
     "report": (Blob("report.html"),),
+    "evaluate": (
+        Blob("metrics.parquet"),  # a row per protocol, region, camera and frame
+        Blob(
+            "renders.npz",
+            {
+                "pixels": Array("uint8", ("P", 4)),  # RGB over grey 0.5 and alpha, picture after picture, row-major
+                "sizes": Array("int32", ("N", 2)),  # height, width of each
+            },
+        ),
+        Blob("cell.json"),  # which picture is which, and what was left out
+    ),
 }

@@ -173,9 +173,15 @@ _FRAMES = TableSchema(
     ),
 )
 
+
+def _with_input_setting(table: pa.Table) -> pa.Table:
+    """Metrics 1 -> 2: rows of before were all made from the video."""
+    return table.append_column("input_setting", pa.array(["video"] * table.num_rows, pa.string()))
+
+
 _METRICS = TableSchema(
     name="metrics",
-    version=1,
+    version=2,
     columns=pa.schema(
         [
             _column("video_id", pa.string()),
@@ -192,8 +198,10 @@ _METRICS = TableSchema(
             _column("perceptual", pa.float64(), optional=True),
             _column("perceptual_name", pa.string(), optional=True),
             _column("iou", pa.float64(), optional=True),
+            _column("input_setting", pa.string(), optional=True),  # what was handed to the method that is scored
         ]
     ),
+    upgrades={1: _with_input_setting},
 )
 
 _EFFECTS = TableSchema(

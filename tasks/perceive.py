@@ -28,13 +28,24 @@ def run_perceive(config: PerceiveConfig, ctx: StageContext) -> StageOutput:
     video = load_npz(ctx.inputs["ingest"] / "frames.npz")
     body = load_body(ctx.body)
     nets = Networks({name: model_path(name) for name in REQUIRED}, num_threads=torch.get_num_threads())
-    found = perceive(video["frames"], video["pts"], video["shot"], None, body, nets, config, ctx.progress)
+    K, viewmat = _camera(config, video["frames"].shape[2])
+    found = perceive(video["frames"], video["pts"], video["shot"], K, body, nets, config, ctx.progress, viewmat=viewmat)
     arrays = {f.name: getattr(found, f.name) for f in dataclasses.fields(found) if f.name != "notes"}
     save_npz(ctx.out / "masks.npz", {name: arrays.pop(name) for name in MASKS}, compress=True)
     save_npz(ctx.out / "body.npz", arrays)
     (ctx.out / "fit.json").write_text(json.dumps(found.notes, indent=1), encoding="utf-8")
     write_png(ctx.out / "overlay.png", contact_sheet(video["frames"], found, body))
     return StageOutput(_summary(found), ("overlay.png",), frames=_rows(found, video))
+
+
+def _camera(config: PerceiveConfig, width: int) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Intrinsics for frames of `width` pixels, and where the camera stands, as far as they are known."""
+    if config.camera is None:
+        return None, None
+    K = np.array(config.camera.K, dtype=np.float64).reshape(3, 3)
+    K[:2] *= width / config.camera.width
+    stands = config.camera.viewmat
+    return K, None if stands is None else np.array(stands, dtype=np.float64).reshape(4, 4)
 
 
 def _summary(found: Perception) -> dict[str, Any]:

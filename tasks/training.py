@@ -97,7 +97,7 @@ def held_out_rows(score: HeldOut | None, after: str, before: str | None = None) 
     if score is None:
         return []
     same = {"protocol": "input-view", "protocol_id": score.protocol, "region": "mask box", "camera": "observed"}
-    row = {**same, "frame": score.frame}
+    row = {**same, "frame": score.frame, "input_setting": "video"}
     first = [{**row, "config": before, "psnr": score.psnr_before, "ssim": score.ssim_before}] if before else []
     return [*first, {**row, "config": after, "psnr": score.psnr_after, "ssim": score.ssim_after}]
 

@@ -37,10 +37,19 @@ def ssim(image: Tensor, target: Tensor) -> float:
     Raises:
         ValueError: If the shapes differ, or a side is shorter than the window's half.
     """
+    return float(ssim_map(image, target).mean())
+
+
+def ssim_map(image: Tensor, target: Tensor) -> Tensor:
+    """Structural similarity [C,H,W] by pixel; at the border the images are continued by reflection.
+
+    Raises:
+        ValueError: As `ssim`.
+    """
     _check(image, target)
     if min(image.shape[-2:]) <= SSIM_WINDOW // 2:
         raise ValueError(f"expected sides above {SSIM_WINDOW // 2} pixels, got {tuple(image.shape[-2:])}")
-    return float(kornia_ssim(image.float()[None], target.float()[None], SSIM_WINDOW).mean())
+    return kornia_ssim(image.float()[None], target.float()[None], SSIM_WINDOW)[0]
 
 
 def iou(mask: Tensor, target: Tensor, threshold: float = 0.5) -> float:

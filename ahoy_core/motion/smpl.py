@@ -26,8 +26,8 @@ _RATES = ("mocap_framerate", "mocap_frame_rate")
 HIP_HEIGHT = 0.93
 """Metres: of the pelvis joint of SMPL's average body above its soles."""
 # SMPL's rest axes (y up, facing +z) -> ours (z up, facing -y); left stays +x.
-_AXES = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]], dtype=torch.float64)
-_PELVIS = (0.0, -0.23, 0.03)  # metres: the pelvis joint in SMPL's own rest space, which the translation is added to
+SMPL_AXES = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]], dtype=torch.float64)
+SMPL_PELVIS = (0.0, -0.23, 0.03)  # metres: the pelvis joint in SMPL's own rest space, which the translation is added to
 
 
 def joint_names(count: int) -> tuple[str, ...]:
@@ -131,10 +131,10 @@ def _poses(arrays: Mapping[str, np.ndarray], name: str) -> np.ndarray:
 
 
 def _clip(name: str, poses: Tensor, trans: Tensor, fps: float, notes: tuple[str, ...]) -> Clip:
-    rotations = _AXES @ axis_angle_to_matrix(poses) @ _AXES.T
+    rotations = SMPL_AXES @ axis_angle_to_matrix(poses) @ SMPL_AXES.T
     # The root's rotation goes from SMPL's rest axes to the z-up world, so it is turned on one side only.
-    rotations[:, 0] = axis_angle_to_matrix(poses[:, 0]) @ _AXES.T
-    root = trans + torch.tensor(_PELVIS, dtype=torch.float64)
+    rotations[:, 0] = axis_angle_to_matrix(poses[:, 0]) @ SMPL_AXES.T
+    root = trans + torch.tensor(SMPL_PELVIS, dtype=torch.float64)
     skeleton = smpl_skeleton(poses.shape[1])
     return Clip(
         name, skeleton, SkeletonPose(rotations, root), fps, HIP_HEIGHT, packaged_from_smpl(skeleton.joint_names), notes

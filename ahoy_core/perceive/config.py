@@ -7,6 +7,22 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 
+class KnownCamera(BaseModel):
+    """The still camera that took the video, where it is known.
+
+    Attributes:
+        K: [9] row-major intrinsics, in pixels of pictures of `width`.
+        viewmat: [16] row-major, world -> camera, from a world with z up and the floor at z = 0; None if not known.
+        width: pixels.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    K: tuple[float, ...] = Field(min_length=9, max_length=9)
+    viewmat: tuple[float, ...] | None = Field(default=None, min_length=16, max_length=16)
+    width: int = Field(ge=1)
+
+
 class PerceiveConfig(BaseModel):
     """Knobs of the stage.
 
@@ -21,6 +37,7 @@ class PerceiveConfig(BaseModel):
         fov_degrees: diagonal field of view assumed where no camera is given.
         outline: weight of the masks' outlines in the fit; 0: landmarks alone.
         mask_refinement: move the mask's edges to the picture's, and hold it down where a still camera shows no change.
+        camera: the camera that took the video; None assumes `fov_degrees`.
         corrector: let the packaged network correct the landmarks and say how far each can be trusted.
     """
 
@@ -34,5 +51,6 @@ class PerceiveConfig(BaseModel):
     smoothing: float = Field(default=1.0, ge=0.0, le=1000.0)
     fov_degrees: float = Field(default=50.0, gt=5.0, lt=150.0)
     outline: float = Field(default=1.0, ge=0.0, le=1000.0)
+    camera: KnownCamera | None = None
     corrector: bool = True
     mask_refinement: bool = True

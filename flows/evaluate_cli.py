@@ -1,0 +1,96 @@
+"""`ahoy evaluate`: scores on captures whose truth is known, and the tables of the ablation."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from pydantic import ValidationError
+from rich.console import Console
+from rich.markup import escape
+
+EXIT_BAD_INPUT, EXIT_SOME_FAILED = 2, 1
+
+
+def evaluate(
+    dataset: Annotated[str, typer.Argument(help="folder of captures (ours, BEHAVE, multi-view), or of videos")],
+    out: Annotated[Path, typer.Option(help="folder for metrics.parquet, table.md, pictures and the chart")],
+    preset: Annotated[str, typer.Option(help="draft, standard or high")] = "standard",
+    ablate: Annotated[str, typer.Option(help="configurations, comma-separated")] = "full,A,B1,B2,C1,C2,C,C3,D",
+    only: Annotated[str | None, typer.Option(help="captures by name, comma-separated")] = None,
+    protocols: Annotated[str | None, typer.Option(help="protocols by name, comma-separated  [default: all]")] = None,
+    kind: Annotated[str, typer.Option(help="auto, ours, behave, multiview or videos")] = "auto",
+    size: Annotated[int, typer.Option(help="longest side of what is compared, pixels")] = 256,
+    input_camera: Annotated[str, typer.Option(help="camera that made the input, where that is open")] = "",
+    truth_body: Annotated[str | None, typer.Option(help="body file that true SMPL parameters belong to")] = None,
+    camera: Annotated[bool, typer.Option(help="tell the method the input's camera")] = True,
+    renders: Annotated[
+        list[str] | None, typer.Option(help="another system's renders, NAME=FOLDER[@INPUT_SETTING]; repeatable")
+    ] = None,
+    beside: Annotated[
+        list[str] | None, typer.Option("--with", help="metrics.parquet of another evaluation, for the same tables")
+    ] = None,
+    withhold: Annotated[int, typer.Option(help="of a plain video, every n-th frame is withheld")] = 8,
+    store: Annotated[str | None, typer.Option(help="URL of the artifact store  [default: OUT/store]")] = None,
+    set_: Annotated[list[str] | None, typer.Option("--set", help="a knob, as STAGE.KNOB=VALUE; repeatable")] = None,
+    prefect: Annotated[bool, typer.Option("--prefect", help="as a Prefect flow, watched at PREFECT_API_URL")] = False,
+) -> None:
+    """Score avatars against the truth; finished cells are found in the store and not made again."""
+    from flows.evaluate import evaluate as run_evaluation
+    from flows.evaluate import evaluate_flow
+    from flows.evaluate_request import EvaluateRequest
+    from flows.terminal import TerminalObserver
+    from tasks.evaluation.results import remarks
+
+    console = Console()
+    fields = {
+        "dataset": dataset,
+        "out": str(out),
+        "store": store,
+        "preset": preset,
+        "kind": kind,
+        "size": size,
+        "input_camera": input_camera,
+        "truth_body": truth_body,
+        "give_camera": camera,
+        "withhold": withhold,
+        "ablate": _names(ablate),
+        "only": _names(only),
+        "overrides": tuple(set_ or ()),
+        "renders": tuple(renders or ()),
+        "beside": tuple(beside or ()),
+        **({"protocols": _names(protocols)} if protocols else {}),
+    }
+    try:
+        request = EvaluateRequest.model_validate(fields)
+        if prefect:
+            paths = {name: Path(path) for name, path in evaluate_flow(request).items()}
+            failed = False
+        else:
+            with TerminalObserver(console) as observer:
+                paths, cells = run_evaluation(
+                    request, observer, told=lambda line: console.print(escape(line), highlight=False, soft_wrap=True)
+                )
+            for line in remarks(cells):
+                console.print(escape(line), highlight=False, soft_wrap=True)
+            failed = any(cell.error for cell in cells)
+    except ValidationError as error:
+        for problem in error.errors():
+            _complain(console, f"--{'.'.join(map(str, problem['loc']))}: {problem['msg']}, got {problem['input']!r}")
+        raise typer.Exit(EXIT_BAD_INPUT) from None
+    except (ValueError, OSError) as error:
+        _complain(console, str(error))
+        raise typer.Exit(EXIT_BAD_INPUT) from None
+    for name, path in paths.items():
+        console.print(f"{name:<20} {path}", soft_wrap=True, highlight=False)
+    if failed:
+        raise typer.Exit(EXIT_SOME_FAILED)
+
+
+def _names(text: str | None) -> tuple[str, ...]:
+    return tuple(name.strip() for name in text.split(",") if name.strip()) if text else ()
+
+
+def _complain(console: Console, message: str) -> None:
+    console.print("[red]error:[/]", escape(message), highlight=False, soft_wrap=True)
