@@ -173,9 +173,15 @@ _FRAMES = TableSchema(
     ),
 )
 
+
+def _with_roles(table: pa.Table) -> pa.Table:
+    """Metrics 1 -> 2: who filled the roles was not recorded."""
+    return table.append_column("roles", pa.nulls(table.num_rows, pa.string()))
+
+
 _METRICS = TableSchema(
     name="metrics",
-    version=1,
+    version=2,
     columns=pa.schema(
         [
             _column("video_id", pa.string()),
@@ -192,8 +198,11 @@ _METRICS = TableSchema(
             _column("perceptual", pa.float64(), optional=True),
             _column("perceptual_name", pa.string(), optional=True),
             _column("iou", pa.float64(), optional=True),
+            _column("roles", pa.string(), optional=True),  # JSON: role -> who filled it, up to what was measured
         ]
     ),
+    upgrades={1: _with_roles},
+    json=("roles",),
 )
 
 _EFFECTS = TableSchema(

@@ -46,7 +46,7 @@ def run_avatar(config: FullConfig, ctx: StageContext) -> StageOutput:
         config,
         AvatarInfo(**coarse.info.model_dump()),
         lambda step, steps, loss: ctx.progress(step, steps, f"loss {loss:.4f}"),
-        perceptual=perceptual_network(),
+        perceptual=perceptual_network(ctx.fills),
         preview=lambda step, picture: _show(previews, step, picture, ctx),
         checkpoint=checkpoint,
     )
@@ -125,4 +125,12 @@ def _roles(config: FullConfig) -> Mapping[str, Role]:
     return {"body": packaged_body(), "rasterizer": ours("ahoy_core.splat on the CPU"), **perceptual_role()}
 
 
-AVATAR = Stage("avatar", 1, FullConfig, ("ingest", "perceive", "texture", "coarse"), run_avatar, _roles)
+AVATAR = Stage(
+    "avatar",
+    1,
+    FullConfig,
+    ("ingest", "perceive", "texture", "coarse"),
+    run_avatar,
+    _roles,
+    fillable=("perceptual",),
+)

@@ -24,6 +24,7 @@ from storage_schema.keys import stage_key
 from storage_schema.store import ArtifactStore, Manifest
 from storage_schema.tables import Tables
 from tasks.errors import message_of
+from tasks.fills import Fills
 from tasks.role import Role as Role
 from tasks.roles import body_role
 
@@ -75,7 +76,7 @@ class StageOutput:
 
 @dataclass(frozen=True)
 class StageContext:
-    """Where a stage's function finds its inputs and puts its outputs, and which body fills that role."""
+    """Where a stage's function finds its inputs and puts its outputs, and who fills the roles."""
 
     inputs: Mapping[str, Path]
     manifests: Mapping[str, Manifest]
@@ -83,6 +84,7 @@ class StageContext:
     progress: ProgressFn
     body: str = PACKAGED
     show: Callable[[Path], None] = lambda picture: None
+    fills: Fills = Fills()
 
 
 @dataclass(frozen=True)
@@ -97,6 +99,7 @@ class Stage:
         roles: who fills which role under a configuration.
         slots: names of scarce resources (`gpu`, `download`) that making it takes one slot each of, under a
             configuration; a stage that is found in the store takes none.
+        fillable: roles that `roles.yaml` may fill otherwise than `roles` says.
     """
 
     name: str
@@ -106,6 +109,7 @@ class Stage:
     run: Callable[[Any, StageContext], StageOutput]
     roles: Callable[[Any], Mapping[str, Role]] = lambda config: {}
     slots: Callable[[Any], Sequence[str]] = lambda config: ()
+    fillable: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -145,13 +149,14 @@ class Source:
 
 @dataclass(frozen=True)
 class Run:
-    """One attempt at one video: where its artifacts and rows go, who watches, and which body is used.
+    """One attempt at one video: where its artifacts and rows go, who watches, and who fills the roles.
 
     Attributes:
         body: a name or the path of a file; keys know it by its contents alone, so it is no knob of a stage.
         take_slots: waits for one slot of each named resource and holds them while its block runs.
         attempt_number: of the video in its batch, from 1.
         sequence: numbers the rows of this run, so that their order does not rest on a clock.
+        fills: roles that something else than the embedded default fills.
     """
 
     store: ArtifactStore
@@ -164,6 +169,7 @@ class Run:
     take_slots: Callable[[Sequence[str]], AbstractContextManager[Any]] = lambda names: nullcontext()
     attempt_number: int = 1
     sequence: Iterator[int] = field(default_factory=itertools.count)
+    fills: Fills = Fills()
 
 
 def run_stage(stage: Stage, config: BaseModel, inputs: Mapping[str, StageRef | Source], run: Run) -> StageRef:
@@ -178,7 +184,7 @@ def run_stage(stage: Stage, config: BaseModel, inputs: Mapping[str, StageRef | S
             f"stage {stage.name}: expected inputs {stage.needs}, got no {sorted(missing)}; run those stages first"
         )
     hashes = {name: inputs[name].content_hash for name in stage.needs}
-    filled_by = dict(stage.roles(config))
+    filled_by = run.fills.filled(stage.roles(config), stage.fillable)
     if "body" in filled_by:
         filled_by["body"] = body_role(run.body)
     roles = {role: dataclasses.asdict(filled) for role, filled in filled_by.items()}
@@ -239,7 +245,9 @@ def _make(
             def show(picture: Path) -> None:
                 run.observer.showed(stage.name, picture)
 
-            output = stage.run(config, StageContext(folders, manifests, attempt.dir, progress, run.body, show))
+            output = stage.run(
+                config, StageContext(folders, manifests, attempt.dir, progress, run.body, show, run.fills)
+            )
             bill = meter.read()
             manifest = attempt.commit(
                 stage_version=stage.version,
@@ -257,7 +265,8 @@ def _make(
         raise
     row = _row(run, stage, config, key, "done", started, bill) | {"attempt": manifest.attempt}
     run.tables.append("stages", [row], batch=run.batch)
-    _append_results(run, key, output)
+    upstream = {role: who for m in manifests.values() for role, who in m.roles.items()}
+    _append_results(run, key, output, {role: who["name"] for role, who in {**upstream, **roles}.items()})
     return manifest
 
 
@@ -281,10 +290,11 @@ def _resolve(
     return manifests, folders
 
 
-def _append_results(run: Run, key: str, output: StageOutput) -> None:
+def _append_results(run: Run, key: str, output: StageOutput, filled_by: Mapping[str, str]) -> None:
     for table, rows in (("frames", output.frames), ("metrics", output.metrics)):
         if rows:
-            who = {"video_id": run.video_id, "key": key} | ({"capture": run.video_id} if table == "metrics" else {})
+            more = {"capture": run.video_id, "roles": dict(filled_by)} if table == "metrics" else {}
+            who = {"video_id": run.video_id, "key": key} | more
             run.tables.append(table, [{**who, **row} for row in rows], batch=run.batch)
 
 

@@ -85,10 +85,18 @@ OPTIONAL: dict[str, dict[str, Any]] = {
         "viewmat": np.eye(4),
         "box": (0, 1, 2, 3),
     },
-    "metrics": {"psnr": math.inf, "ssim": 0.5, "perceptual": 0.25, "perceptual_name": "net", "iou": 1.0},
+    "metrics": {
+        "psnr": math.inf,
+        "ssim": 0.5,
+        "perceptual": 0.25,
+        "perceptual_name": "net",
+        "iou": 1.0,
+        "roles": {"pose": "net"},
+    },
 }
 STORED = {
     "knobs": '{"a":[1,null],"b":0.1}',
+    "roles": '{"pose":"net"}',
     "accuracy": '{"px":3.5}',
     "options": '{"subject":1}',
     "pose": [0, 1, 2, 3, 4, 5],
