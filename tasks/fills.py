@@ -1,8 +1,8 @@
 """Which model fills each role on this machine: `roles.yaml`, read once, loaded when a stage first asks.
 
-A choice is a machine's, not a batch's: paths and commands are only true where the files are, and a batch's manifest, which
-comes from a shared store, must not be able to name a program. Keys know a model by the contents of its files, so machines
-that are set up alike make the same artifacts, and others don't mix with them.
+A choice is a machine's, not a batch's: paths and commands are only true where the files are, and a batch's manifest,
+which comes from a shared store, must not be able to name a program. Keys know a model by the contents of its files, so
+machines that are set up alike make the same artifacts, and others don't mix with them.
 """
 
 from __future__ import annotations

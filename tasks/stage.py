@@ -84,7 +84,7 @@ class StageContext:
     progress: ProgressFn
     body: str = PACKAGED
     show: Callable[[Path], None] = lambda picture: None
-    fills: Fills = Fills()
+    fills: Fills = field(default_factory=Fills)
 
 
 @dataclass(frozen=True)
@@ -169,7 +169,7 @@ class Run:
     take_slots: Callable[[Sequence[str]], AbstractContextManager[Any]] = lambda names: nullcontext()
     attempt_number: int = 1
     sequence: Iterator[int] = field(default_factory=itertools.count)
-    fills: Fills = Fills()
+    fills: Fills = field(default_factory=Fills)
 
 
 def run_stage(stage: Stage, config: BaseModel, inputs: Mapping[str, StageRef | Source], run: Run) -> StageRef:

@@ -152,7 +152,7 @@ def load_lpips(fill: Fill, adapter: Adapter, backbone: Backbone) -> Lpips:
     return network.to(device_of(fill)).eval()
 
 
-def _convs(network: Lpips) -> list[tuple[Conv, nn.Conv2d]]:
+def _convs(network: Lpips) -> list[tuple[Conv, nn.Module]]:
     pairs = zip(network.backbone.stages, network.stages, strict=True)
     return [pair for said, built in pairs for pair in zip(said, cast(nn.ModuleList, built), strict=True)]
 

@@ -34,6 +34,8 @@ def by_definition(folder: Path, backbone: str, a: Tensor, b: Tensor) -> Tensor:
     total = torch.zeros(len(a))
     pair = [((2 * x - 1) - shift[:, None, None]) / scale[:, None, None] for x in (a, b)]
     for number, layer in enumerate(features):
+        if number > READ[backbone][-1]:
+            break
         pair = [layer(x) for x in pair]
         if number in READ[backbone]:
             head = heads[f"lin{READ[backbone].index(number)}.model.1.weight"]

@@ -1,4 +1,4 @@
-"""Tiny checkpoints in the true on-disk formats of the models behind the roles: names and layouts are theirs, numbers ours."""
+"""Tiny checkpoints in the true on-disk formats of the roles' models: names and layouts are theirs, numbers ours."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def vgg16_features() -> nn.Sequential:
 
 
 def lpips(folder: Path, backbone: str) -> Path:
-    """A folder with both files of LPIPS on "alex" or "vgg"; the backbone's file has a classifier too, as torchvision's."""
+    """A folder with both files of LPIPS on "alex" or "vgg"; as torchvision's, the backbone's has a classifier too."""
     torch.manual_seed(1)
     features, name, widths = {
         "alex": (alexnet_features, "alexnet-owt-7be5be79.pth", ALEX_HEADS),
