@@ -7,9 +7,11 @@ from typing import Final
 
 from ahoy_core.models.adapter import Adapter, Fill
 from ahoy_core.models.errors import ModelError
-from ahoy_core.models.perceptual_adapters import PERCEPTUAL
+from ahoy_core.models.generative_adapters import GENERATIVE
+from ahoy_core.models.measure_adapters import MEASURES
+from ahoy_core.models.people_adapters import PEOPLE
 
-ADAPTERS: Final[tuple[Adapter, ...]] = (*PERCEPTUAL,)
+ADAPTERS: Final[tuple[Adapter, ...]] = (*PEOPLE, *GENERATIVE, *MEASURES)
 
 EMBEDDED: Final = "embedded"
 """What fills a role when nothing is said."""

@@ -28,7 +28,7 @@ def read_state(path: Path, adapter: Adapter) -> dict[str, Tensor]:
         state = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # torch raises whatever its readers meet in a broken file
         raise CheckpointError(
-            f"{adapter.label}: {path} cannot be read as weights ({_short(error)}, {path.stat().st_size} bytes, sha256 "
+            f"{adapter.label}: {path} cannot be read as weights ({short(error)}, {path.stat().st_size} bytes, sha256 "
             f"{digest(path)[:12]}); it is truncated or no weights file: {adapter.how_to_get()}"
         ) from error
     if not isinstance(state, Mapping) or not all(isinstance(value, Tensor) for value in state.values()):
@@ -77,7 +77,7 @@ def pretrained(cls: Any, folder: Path, fill: Fill, adapter: Adapter, **more: Any
         model, info = cls.from_pretrained(str(folder), **kwargs)
     except Exception as error:  # the libraries raise OSError, ValueError, RuntimeError and safetensors' own
         raise CheckpointError(
-            f"{adapter.label}: {folder} cannot be read as {cls.__name__} ({_short(error)}); {adapter.how_to_get()}"
+            f"{adapter.label}: {folder} cannot be read as {cls.__name__} ({short(error)}); {adapter.how_to_get()}"
         ) from error
     bad = [*info.get("missing_keys", ()), *(str(each) for each in info.get("mismatched_keys", ()))]
     if bad:
@@ -149,6 +149,7 @@ def _some(names: Iterable[str]) -> str:
     return ", ".join(listed[:NAMED]) + more
 
 
-def _short(error: BaseException) -> str:
+def short(error: BaseException) -> str:
+    """Class and first line of an error."""
     text = str(error).strip().splitlines()
     return f"{type(error).__name__}: {text[0][:200] if text else ''}"

@@ -1,4 +1,4 @@
-"""Declarations of what can fill the role "perceptual"."""
+"""Declarations of what can fill the roles that measure: perceptual."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from ahoy_core.models.adapter import Adapter, ExpectedFile
 _HEADS = "github.com/richzhang/PerceptualSimilarity (also inside the wheel lpips==0.1.4, lpips/weights/v0.1/)"
 _TERMS = "heads BSD-2-Clause; backbone: torchvision's BSD-3-Clause weights, trained on ImageNet (its terms: research)"
 
-PERCEPTUAL: Final = (
+MEASURES: Final = (
     Adapter(
         role="perceptual",
         name="lpips-alex",
