@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from ahoy_core.conventions import Cameras
-from ahoy_core.formats.images import read_png, to_uint8, write_png
+from ahoy_core.formats.images import read_png, to_float, to_uint8, write_png
 from ahoy_core.models.adapter import Adapter, Fill
 from ahoy_core.models.errors import CommandError
 

@@ -63,9 +63,11 @@ class TinyDensePose(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         fine = torch.full((1, 25, 28, 28), -4.0)
-        for part, rows, columns in ((23, (0, 5), (9, 19)), (2, (5, 14), (8, 20)), (15, (5, 14), (0, 8)),
-                                    (16, (5, 14), (20, 28)), (7, (14, 28), (0, 14)), (8, (14, 28), (14, 28))):  # fmt:
-                                    skip
+        places = (
+            (23, (0, 5), (9, 19)), (2, (5, 14), (8, 20)), (15, (5, 14), (0, 8)),
+            (16, (5, 14), (20, 28)), (7, (14, 28), (0, 14)), (8, (14, 28), (14, 28)),
+        )  # fmt: skip
+        for part, rows, columns in places:
             fine[0, part, rows[0] : rows[1], columns[0] : columns[1]] = 4
         self.fine = nn.Parameter(fine)
         self.coarse = nn.Parameter(torch.tensor([-1.0, 1.0])[None, :, None, None].expand(1, 2, 28, 28).clone())
