@@ -13,6 +13,7 @@ import torch
 
 from ahoy_core.avatar.avatar import Avatar, AvatarInfo
 from ahoy_core.avatar.coarse_renders import coarse_sequences
+from ahoy_core.avatar.face_role import generated_faces
 from ahoy_core.avatar.face_views import observed_faces
 from ahoy_core.avatar.files import load_avatar, save_avatar
 from ahoy_core.avatar.full import FullResult, train_full
@@ -23,6 +24,7 @@ from ahoy_core.avatar.supervision import CoarseInputs
 from ahoy_core.body.canonical import canonical_pose
 from ahoy_core.formats.images import contact_sheet, to_uint8, write_png
 from ahoy_core.formats.npz import load_npz
+from ahoy_core.models.contracts import Face
 from tasks.roles import ours, packaged_body, perceptual_network, perceptual_role
 from tasks.stage import Role, Stage, StageContext, StageOutput
 from tasks.training import compare, draw_training, held_out_rows, load_inputs, training_summary
@@ -38,7 +40,7 @@ def run_avatar(config: FullConfig, ctx: StageContext) -> StageOutput:
     observed = load_inputs(ctx.inputs["ingest"], ctx.inputs["perceive"], ctx.inputs["texture"], ctx.body)
     if not config.switches.full:
         return _keep_coarse(coarse, observed, ctx)
-    inputs, notes = _full_inputs(coarse, observed, config, ctx.inputs["perceive"])
+    inputs, notes = _full_inputs(coarse, observed, config, ctx.inputs["perceive"], ctx.fills.get("face"))
     previews: list[tuple[int, np.ndarray]] = []
     checkpoint = checkpoint_path(config, ctx)
     result = train_full(
@@ -68,7 +70,7 @@ def checkpoint_path(config: FullConfig, ctx: StageContext) -> Path:
 
 
 def _full_inputs(
-    coarse: Avatar, observed: CoarseInputs, config: FullConfig, perceive: Path
+    coarse: Avatar, observed: CoarseInputs, config: FullConfig, perceive: Path, face: Face | None
 ) -> tuple[FullInputs, list[str]]:
     """What equation 9 asks for; the hallucinated sequences are coarse renders as long as no prior repaints them."""
     template = coarse.template
@@ -77,6 +79,8 @@ def _full_inputs(
     expression = torch.from_numpy(load_npz(perceive / "body.npz", ["expression"])["expression"])
     kinematics = Kinematics.of(observed.body, observed.betas.float())
     faces, reason = observed_faces(observed, template, kinematics, expression)
+    if face is not None and faces is not None:
+        faces = generated_faces(face, faces, template, kinematics)
     if config.switches.supervise == "none":
         return FullInputs(observed, template, base, (), faces, reason), ["no sequences: switched off (B1)"]
     sequences = coarse_sequences(coarse, observed.body, _map_poses(observed))
@@ -132,5 +136,5 @@ AVATAR = Stage(
     ("ingest", "perceive", "texture", "coarse"),
     run_avatar,
     _roles,
-    fillable=("perceptual",),
+    fillable=("perceptual", "face"),
 )

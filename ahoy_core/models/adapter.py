@@ -138,6 +138,13 @@ class Adapter:
                 "it comes from, say trust_code: true in roles.yaml (or --trust-code)"
             )
 
+    def fits(self, path: Path) -> bool:
+        """Whether a path looks like this adapter's checkpoint: its names are there, or its ending is the right one."""
+        if all(file.name == "" for file in self.files):
+            endings = {Path(word.strip(",")).suffix for word in self.files[0].what.split() if "." in word}
+            return path.is_file() and path.suffix in endings
+        return path.is_dir() and all(_found(path, file.name) for file in self.files)
+
     def _require_files(self, fill: Fill) -> None:
         if fill.path is None:
             raise CheckpointError(f"{self.label}: expected a path, got none; {self.how_to_get()}")
