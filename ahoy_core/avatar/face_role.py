@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Final
 
 import torch
@@ -31,9 +32,7 @@ def face_cameras(template: Template, side: int) -> Cameras:
     head = template.means[template.head]
     centre, extent = (head.amax(0) + head.amin(0)) / 2, float((head.amax(0) - head.amin(0)).max())
     azimuths = torch.deg2rad(torch.tensor(AZIMUTHS))
-    eyes = torch.cat(
-        [orbit_eyes(centre, DISTANCE, azimuths, float(torch.deg2rad(torch.tensor(e)))) for e in ELEVATIONS]
-    )
+    eyes = torch.cat([orbit_eyes(centre, DISTANCE, azimuths, math.radians(up)) for up in ELEVATIONS])
     focal = FILLS * side * DISTANCE / extent
     K = torch.tensor([[focal, 0, side / 2], [0, focal, side / 2], [0, 0, 1.0]])
     return Cameras(look_at(eyes, centre), K.expand(len(eyes), 3, 3).clone(), side, side)

@@ -83,6 +83,7 @@ class Adapter:
         load: "module:function" that takes a `Fill` and returns the role's object.
         extra: of this project that installs what it needs; None where nothing is needed.
         packages: modules that extra brings.
+        endings: of the file's name, where the checkpoint is one file.
         is_code: the checkpoint is a program.
         is_command: it runs as an external command.
     """
@@ -101,6 +102,7 @@ class Adapter:
     device: Literal["cpu", "cuda"] = "cpu"
     extra: str | None = None
     packages: tuple[str, ...] = ()
+    endings: tuple[str, ...] = ()
     is_code: bool = False
     is_command: bool = False
 
@@ -140,9 +142,8 @@ class Adapter:
 
     def fits(self, path: Path) -> bool:
         """Whether a path looks like this adapter's checkpoint: its names are there, or its ending is the right one."""
-        if all(file.name == "" for file in self.files):
-            endings = {Path(word.strip(",")).suffix for word in self.files[0].what.split() if "." in word}
-            return path.is_file() and path.suffix in endings
+        if self.endings:
+            return path.is_file() and path.suffix in self.endings
         return path.is_dir() and all(_found(path, file.name) for file in self.files)
 
     def _require_files(self, fill: Fill) -> None:

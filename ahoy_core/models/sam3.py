@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Literal
 
 import torch
@@ -72,16 +73,16 @@ class Sam3Image:
         masks = torch.zeros(len(frames), 1, *frames.shape[2:])
         there = torch.nonzero(torch.isfinite(boxes).all(1)).flatten()
         if len(there):
-            text = self.model.get_text_features(self.ids, self.attention, return_dict=True)
+            text = self.model.get_text_features(self.ids, self.attention, return_dict=True).pooler_output
             packed = torch.cat([frames[there].flatten(1), boxes[there].to(frames)], 1)
             found = in_batches(lambda rows: self._batch(rows, frames.shape[1:], text), packed, self.options.batch)
             masks[there] = found
         return masks
 
-    def _batch(self, rows: Tensor, shape: torch.Size, text: Any) -> Tensor:
+    def _batch(self, rows: Tensor, shape: torch.Size, text: Tensor) -> Tensor:
         frames, boxes = rows[:, :-4].unflatten(1, shape), rows[:, -4:]
         pixels = prepared(frames, self.model)
-        text = type(text)(pooler_output=text.pooler_output.expand(len(frames), -1, -1))
+        text = SimpleNamespace(pooler_output=text.expand(len(frames), -1, -1))  # all that the model reads of it
         out = self.model(pixel_values=pixels, text_embeds=text, attention_mask=self.attention.expand(len(frames), -1))
         scores = out.pred_logits.float().sigmoid() * out.presence_logits.float().sigmoid()
         size = torch.tensor([shape[2], shape[1], shape[2], shape[1]], device=scores.device)

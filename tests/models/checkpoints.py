@@ -86,6 +86,7 @@ def sam3(folder: Path) -> Path:
     text = {
         "model_type": "clip_text_model", "vocab_size": 514, "hidden_size": 32, "intermediate_size": 32,
         "projection_dim": 32, "num_hidden_layers": 1, "num_attention_heads": 2, "max_position_embeddings": 32,
+        "bos_token_id": 512, "eos_token_id": 513, "pad_token_id": 513,
     }  # fmt: skip
     detector = {
         "model_type": "sam3", "vision_config": vision, "text_config": text,
