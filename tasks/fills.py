@@ -77,8 +77,11 @@ class Fills:
         return str(fill.path)
 
     def preload(self) -> list[str]:
-        """Load every model that is no command; returns the roles. For a process that others are forked from."""
-        roles = [role for role, fill in self.chosen.items() if not fill.command and role != "body"]
+        """Load the models that work on the CPU, for a process that others are forked from; returns their roles.
+
+        A GPU's context does not survive a fork, so its models are loaded by each fork, out of the page cache.
+        """
+        roles = [role for role, fill in self.chosen.items() if not fill.command and fill.device == "cpu"]
         for role in roles:
             self.get(role)
         return roles

@@ -82,8 +82,8 @@ class Sam3Image:
     def _batch(self, rows: Tensor, shape: torch.Size, text: Tensor) -> Tensor:
         frames, boxes = rows[:, :-4].unflatten(1, shape), rows[:, -4:]
         pixels = prepared(frames, self.model)
-        text = SimpleNamespace(pooler_output=text.expand(len(frames), -1, -1))  # all that the model reads of it
-        out = self.model(pixel_values=pixels, text_embeds=text, attention_mask=self.attention.expand(len(frames), -1))
+        words = SimpleNamespace(pooler_output=text.expand(len(frames), -1, -1))  # all that the model reads of it
+        out = self.model(pixel_values=pixels, text_embeds=words, attention_mask=self.attention.expand(len(frames), -1))
         scores = out.pred_logits.float().sigmoid() * out.presence_logits.float().sigmoid()
         size = torch.tensor([shape[2], shape[1], shape[2], shape[1]], device=scores.device)
         overlap = box_overlap(out.pred_boxes.float() * size, boxes[:, None].to(scores))

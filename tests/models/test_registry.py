@@ -106,8 +106,10 @@ def test_a_key_knows_contents_and_knobs_but_no_path_and_no_device(tmp_path: Path
 
 
 def test_a_model_is_loaded_once(tmp_path: Path) -> None:
-    fills = Fills({"perceptual": Fill(fill="lpips-alex", path=BUILDERS["perceptual", "lpips-alex"](tmp_path))})
-    assert fills.preload() == ["perceptual"]
+    path = BUILDERS["perceptual", "lpips-alex"](tmp_path)
+    fills = Fills({"perceptual": Fill(fill="lpips-alex", path=path, device="cpu")})
+    assert fills.preload() == ["perceptual"], "what works on the CPU can be handed to forks"
+    assert Fills({"perceptual": Fill(fill="lpips-alex", path=path, device="cuda")}).preload() == []
     assert fills.get("perceptual") is fills.get("perceptual")
     assert fills.get("mask") is None
 
