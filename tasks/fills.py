@@ -22,6 +22,7 @@ from pydantic import TypeAdapter, ValidationError
 from ahoy_core.body.load import PACKAGED
 from ahoy_core.models.adapter import Fill
 from ahoy_core.models.catalogue import adapter, check_fills
+from ahoy_core.models.checkpoint import device_of
 from ahoy_core.models.errors import ModelError
 from tasks.role import Role
 
@@ -67,6 +68,17 @@ class Fills:
         """A stage's roles, with those that are filled otherwise replaced or added."""
         own = {role: found for role in fillable if (found := self.role(role)) is not None}
         return {**defaults, **own}
+
+    def slots(self, fillable: tuple[str, ...]) -> tuple[str, ...]:
+        """Scarce resources that a stage's fills need one slot each of: `gpu`, where one of them works on a GPU.
+
+        Raises:
+            ModelError: a GPU is asked for where there is none.
+        """
+        used = [self.chosen[role] for role in fillable if role in self.chosen]
+        # Commands bring devices of their own, of which we know nothing but what is said.
+        busy = any(f.device.startswith("cuda") if f.command else device_of(f).type == "cuda" for f in used)
+        return ("gpu",) if busy else ()
 
     def body(self, said: str) -> str:
         """The body's name or file: what a run's settings say, else what `roles.yaml` says."""

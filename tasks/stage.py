@@ -205,7 +205,7 @@ def run_stage(stage: Stage, config: BaseModel, inputs: Mapping[str, StageRef | S
             if manifest is None:
                 state = "done"
                 # The lease first: whoever holds a slot never waits for a lease, so nobody waits in a circle.
-                with run.take_slots(stage.slots(config)):
+                with run.take_slots((*stage.slots(config), *run.fills.slots(stage.fillable))):
                     manifest = _make(stage, config, inputs, run, key, hashes, roles, started)
     ref = StageRef(stage.name, key, manifest.content_hash, state, Bill(**manifest.summary["bill"]))
     if state == "cached":

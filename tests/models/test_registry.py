@@ -114,6 +114,22 @@ def test_a_model_is_loaded_once(tmp_path: Path) -> None:
     assert fills.get("mask") is None
 
 
+def test_a_stage_takes_a_gpus_slot_only_where_its_own_models_work_on_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    fills = Fills({"mask": Fill(fill="sam3", device="cpu"), "views": Fill(fill="synchuman", command=("x",))})
+    assert fills.slots(("mask", "views")) == ()
+    busy = Fills({"views": Fill(fill="synchuman", command=("x",), device="cuda")})
+    assert busy.slots(("views",)) == ("gpu",) and busy.slots(("mask",)) == ()
+    auto = Fills({"mask": Fill(fill="sam3")})
+    for there, expected in ((True, ("gpu",)), (False, ())):
+        monkeypatch.setattr("torch.cuda.is_available", lambda there=there: there)
+        assert auto.slots(("mask",)) == expected
+
+
+def test_the_example_of_deploy_is_read_and_fills_every_role() -> None:
+    fills = read_fills((ROOT / "deploy" / "roles.yaml").read_text())
+    assert set(fills.chosen) == {each.role for each in ADAPTERS}
+
+
 def test_a_stage_keeps_its_defaults_where_nothing_is_chosen(tmp_path: Path) -> None:
     default = {"perceptual": Role("ST-LPIPS", "BSD-2-Clause", "1" * 64), "body": Role("b", "x")}
     fills = Fills({"perceptual": Fill(fill="lpips-alex", path=BUILDERS["perceptual", "lpips-alex"](tmp_path))})
