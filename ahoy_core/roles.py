@@ -17,7 +17,6 @@ from ahoy_core.texture.fill import fill_atlas
 from ahoy_core.texture.fillings import TexturedBody
 from ahoy_core.texture.selfcheck import Completion
 
-
 __all__ = ["COMPLETIONS", "FILLINGS", "Perceptual"]
 
 COMPLETIONS: Final[Mapping[str, Completion]] = {

@@ -24,6 +24,7 @@ from ahoy_core.models.contracts import PoseEstimate
 # The family's files are y up and face +z; ours are z up and face -y.
 _FROM_FILE: Final = ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0))
 _PULL: Final = 0.05  # of shape parameters to an average adult, against relative errors of limb lengths
+_BONE: Final = 0.15  # metres: shorter ones (fingers) say little of a person's size, and there are many
 _STEP: Final = 1e-3  # of shape parameters in finite differences
 _RANGE: Final = (0.0, 1.0)  # of the packaged body's parameters
 
@@ -115,7 +116,7 @@ def fit_shape(body: BodyModel, skeleton: Skeleton) -> Tensor:
     if not bones:
         return body.default_betas
     inside = np.clip(start, _RANGE[0] + _STEP, _RANGE[1] - _STEP)
-    found = least_squares(residuals, inside, bounds=_RANGE, diff_step=_STEP, max_nfev=20)
+    found = least_squares(residuals, inside, bounds=_RANGE, diff_step=_STEP, max_nfev=5)
     return torch.from_numpy(found.x).to(body.default_betas)
 
 
@@ -128,7 +129,10 @@ def _bones(body: BodyModel, skeleton: Skeleton, pairs: dict[str, str] | object) 
         above = body.parents[joint]
         while above >= 0 and above not in numbers:
             above = body.parents[above]
-        if above >= 0 and is_limb(body.joint_names[joint]) and is_limb(body.joint_names[above]):
+        if above < 0:
+            continue
+        length = float((skeleton.rest_joints[partner] - skeleton.rest_joints[numbers[above]]).norm())
+        if length > _BONE and is_limb(body.joint_names[joint]) and is_limb(body.joint_names[above]):
             bones.append((above, joint, numbers[above], partner))
     return bones
 

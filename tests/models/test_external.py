@@ -36,7 +36,10 @@ def test_the_words_hold_the_folders_and_no_shell_reads_them() -> None:
 
 
 def test_a_failing_command_is_quoted_with_its_last_words() -> None:
-    with exchange("test") as (given, made), pytest.raises(CommandError, match=r"status 3.*no memory left") as raised:
+    with (
+        exchange("test") as (given, made),
+        pytest.raises(CommandError, match=r"(?s)status 3.*no memory left") as raised,
+    ):
         run_command(running("import sys; print('x' * 9000); print('no memory left'); sys.exit(3)"), VIEWS, given, made)
     assert len(str(raised.value)) < 2000
 
