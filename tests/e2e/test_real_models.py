@@ -40,13 +40,14 @@ def chosen(folder: Path) -> Fills:
     return Fills(fills)
 
 
+@pytest.mark.slow
 def test_every_role_filled_by_its_production_adapter(
     models: None, demo_clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fills = chosen(tmp_path / "models")
     monkeypatch.setenv(ENVIRONMENT, fills.to_json())
     out = tmp_path / "out"
-    result = ahoy("run", str(demo_clip), "--out", str(out), *small_options())
+    result = ahoy("run", str(demo_clip), "--out", str(out), *small_options(), "--set", "ingest.max_frames=4")
     assert result.exit_code == 0, result.output
     page = next(out.glob("*/report.html")).read_text()
     for role in CHOSEN:
