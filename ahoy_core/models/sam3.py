@@ -117,10 +117,12 @@ class Sam3Video:
             frames: [T,3,H,W] in [0,1].
             boxes: [T,4] x0 y0 x1 y1, pixels; NaN where the subject is not.
         """
+        if not bool(torch.isfinite(boxes).all(1).any()):
+            return torch.zeros(len(frames), 1, *frames.shape[2:])
         # Pieces of equal length: a last piece of one frame would have nothing to follow.
-        count = max(1, math.ceil(len(frames) / self.options.frames))
+        count = math.ceil(len(frames) / self.options.frames)
         pieces = [self._piece(*piece) for piece in zip(frames.chunk(count), boxes.chunk(count), strict=True)]
-        return torch.cat(pieces) if len(frames) else torch.zeros(0, 1, *frames.shape[2:])
+        return torch.cat(pieces)
 
     def _piece(self, frames: Tensor, boxes: Tensor) -> Tensor:
         people: dict[int, Tensor] = {}
