@@ -1,13 +1,13 @@
-"""The roles that models fill, as protocols, and one explicit table of who can fill them.
+"""The embedded fillings of the roles, in one explicit table; real models are in `ahoy_core.models.catalogue`.
 
-Contracts: float32, RGB in [0,1], metres, OpenCV cameras. Nothing registers itself; a new filling is one entry here.
+Nothing registers itself; a new filling is one entry here. The protocols are in `ahoy_core.models.contracts`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 from torch import Tensor
 
@@ -18,22 +18,6 @@ from ahoy_core.metrics.stlpips import load_stlpips
 from ahoy_core.texture.fill import fill_atlas
 from ahoy_core.texture.fillings import TexturedBody
 from ahoy_core.texture.selfcheck import Completion
-
-
-class Inpaint(Protocol):
-    """Role "inpaint" (the paper: FLUX Fill)."""
-
-    def __call__(self, image: Tensor, mask: Tensor, prompt: str = "", seed: int = 0) -> Tensor:
-        """Image [3,H,W] and mask [1,H,W] (1 = fill) -> image [3,H,W]."""
-        ...
-
-
-class Views(Protocol):
-    """Role "views" (the paper: SyncHuman)."""
-
-    def __call__(self, image: Tensor, mask: Tensor) -> tuple[Tensor, tuple[float, ...]]:
-        """Canonical image [3,H,W] and mask [1,H,W] -> views [4,3,H,W] and their azimuths in degrees."""
-        ...
 
 
 def _prior_inpaint(*arguments: Any, **named: Any) -> Tensor:
@@ -50,7 +34,7 @@ def _prior_views(*arguments: Any, **named: Any) -> tuple[Tensor, tuple[float, ..
     return PriorBody.views(*arguments, **named)
 
 
-__all__ = ["COMPLETIONS", "FILLINGS", "Inpaint", "Perceptual", "Views"]
+__all__ = ["COMPLETIONS", "FILLINGS", "Perceptual"]
 
 COMPLETIONS: Final[Mapping[str, Completion]] = {
     "symmetry + harmonic": partial(fill_atlas, fill="both"),

@@ -75,6 +75,15 @@ def run(
     set_: Annotated[
         list[str] | None, typer.Option("--set", help="a knob, as STAGE.KNOB=VALUE; may be repeated")
     ] = None,
+    roles: Annotated[
+        Path | None, typer.Option(help="roles.yaml: which model fills each role  [default: AHOY_ROLES]")
+    ] = None,
+    role: Annotated[
+        list[str] | None, typer.Option("--role", help="one role, as ROLE=FILL:PATH or ROLE=embedded; may be repeated")
+    ] = None,
+    trust_code: Annotated[
+        bool, typer.Option("--trust-code", help="TorchScript files that --role names are programs and may be run")
+    ] = False,
     prefect: Annotated[
         bool, typer.Option("--prefect", help="run as a Prefect flow, watched at PREFECT_API_URL")
     ] = False,
@@ -84,6 +93,7 @@ def run(
 
     console = Console()
     try:
+        models_cli.choose_roles(roles, role or [], trust_code)
         request = VideoRequest.model_validate(
             {
                 "video": video,

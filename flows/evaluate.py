@@ -34,8 +34,9 @@ from tasks.evaluation.results import Cell, read_metrics, write_results
 from tasks.evaluation.truths import Truths
 from tasks.evaluation.withhold import WITHHOLD, WithholdConfig
 from tasks.presets import PRESETS
+from tasks.running import run_stage
 from tasks.settings import Settings
-from tasks.stage import Observer, Run, Source, Stage, StageRef, run_stage
+from tasks.stage import Observer, Run, Source, Stage, StageRef
 
 BATCH = "evaluate"
 _UNSAFE = re.compile(r"[^A-Za-z0-9._-]+")

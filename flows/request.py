@@ -14,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from storage_schema.artifacts import ARTIFACTS, Blob
 from storage_schema.store import ArtifactStore
 from storage_schema.tables import Tables
+from tasks.fills import fills_from_environment
 from tasks.presets import PRESETS
 from tasks.settings import Preset, Settings
 from tasks.sources import fetch_source, policy_from_environment
@@ -75,9 +76,14 @@ class VideoRequest(BaseModel):
         return self.video_id or f"{source.name}-{source.content_hash[:8]}"
 
     def run(self, video_id: str, observer: Observer, store: ArtifactStore | None = None) -> Run:
-        """Name this attempt; its results go to `store`, opened here unless given."""
+        """Name this attempt; its results go to `store`, opened here unless given.
+
+        Raises:
+            ModelError: what fills the roles on this machine is not stated as it should be.
+        """
         store = store or self.open_store()
         run_id = uuid.uuid4().hex[:12]
+        fills = fills_from_environment()
         return Run(
             store,
             Tables(store),
@@ -85,9 +91,10 @@ class VideoRequest(BaseModel):
             video_id,
             run_id,
             observer,
-            self.settings().body,
+            fills.body(self.settings().body),
             attempt_number=self.attempt,
             prior=self.settings().prior,
+            fills=fills,
         )
 
 

@@ -174,9 +174,10 @@ _FRAMES = TableSchema(
 )
 
 
-def _with_input_setting(table: pa.Table) -> pa.Table:
-    """Metrics 1 -> 2: rows of before were all made from the video."""
-    return table.append_column("input_setting", pa.array(["video"] * table.num_rows, pa.string()))
+def _with_input_setting_and_roles(table: pa.Table) -> pa.Table:
+    """Metrics 1 -> 2: rows of before were all made from the video; who filled the roles was not recorded."""
+    told = table.append_column("input_setting", pa.array(["video"] * table.num_rows, pa.string()))
+    return told.append_column("roles", pa.nulls(table.num_rows, pa.string()))
 
 
 _METRICS = TableSchema(
@@ -199,9 +200,11 @@ _METRICS = TableSchema(
             _column("perceptual_name", pa.string(), optional=True),
             _column("iou", pa.float64(), optional=True),
             _column("input_setting", pa.string(), optional=True),  # what was handed to the method that is scored
+            _column("roles", pa.string(), optional=True),  # JSON: role -> who filled it, up to what was measured
         ]
     ),
-    upgrades={1: _with_input_setting},
+    upgrades={1: _with_input_setting_and_roles},
+    json=("roles",),
 )
 
 _EFFECTS = TableSchema(

@@ -13,6 +13,7 @@ import torch
 
 from ahoy_core.avatar.avatar import Avatar, AvatarInfo
 from ahoy_core.avatar.coarse_renders import coarse_sequences
+from ahoy_core.avatar.face_role import generated_faces
 from ahoy_core.avatar.face_views import observed_faces
 from ahoy_core.avatar.files import load_avatar, save_avatar
 from ahoy_core.avatar.full import FullResult, train_full
@@ -48,7 +49,7 @@ def run_avatar(config: FullConfig, ctx: StageContext) -> StageOutput:
         config,
         AvatarInfo(**coarse.info.model_dump()),
         lambda step, steps, loss: ctx.progress(step, steps, f"loss {loss:.4f}"),
-        perceptual=perceptual_network(),
+        perceptual=perceptual_network(ctx.fills),
         preview=lambda step, picture: _show(previews, step, picture, ctx),
         checkpoint=checkpoint,
     )
@@ -79,6 +80,9 @@ def _full_inputs(
     expression = torch.from_numpy(load_npz(ctx.inputs["perceive"] / "body.npz", ["expression"])["expression"])
     kinematics = Kinematics.of(observed.body, observed.betas.float())
     faces, reason = observed_faces(observed, template, kinematics, expression)
+    face = ctx.fills.get("face")
+    if face is not None and faces is not None:
+        faces = generated_faces(face, faces, template, kinematics)
     if config.switches.supervise == "none":
         return FullInputs(observed, template, base, (), faces, reason), ["no sequences: switched off (B1)"]
     if (made := _hallucinated(ctx)) and config.switches.supervise == "hallucinated":
@@ -144,4 +148,5 @@ AVATAR = Stage(
     run_avatar,
     _roles,
     wants=("complete", "hallucinate"),
+    fillable=("perceptual", "face"),
 )

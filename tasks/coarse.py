@@ -27,7 +27,7 @@ def run_coarse(config: CoarseConfig, ctx: StageContext) -> StageOutput:
         config,
         info,
         lambda step, steps, loss: ctx.progress(step, steps, f"loss {loss:.4f}"),
-        perceptual=perceptual_network(),
+        perceptual=perceptual_network(ctx.fills),
     )
     save_avatar(result.avatar, ctx.out)
     draw_training(result, TERMS, inputs, ctx.out)
@@ -42,4 +42,13 @@ def _roles(config: CoarseConfig) -> Mapping[str, Role]:
     return {"body": packaged_body(), "rasterizer": ours("ahoy_core.splat on the CPU"), **perceptual_role()}
 
 
-COARSE = Stage("coarse", 3, CoarseConfig, ("ingest", "perceive", "texture"), run_coarse, _roles, wants=("complete",))
+COARSE = Stage(
+    "coarse",
+    3,
+    CoarseConfig,
+    ("ingest", "perceive", "texture"),
+    run_coarse,
+    _roles,
+    wants=("complete",),
+    fillable=("perceptual",),
+)

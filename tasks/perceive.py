@@ -13,6 +13,7 @@ import torch
 from ahoy_core.body.load import load_body
 from ahoy_core.formats.images import write_png
 from ahoy_core.formats.npz import load_npz, save_npz
+from ahoy_core.perceive.filled import Filled
 from ahoy_core.perceive.networks import REQUIRED, Networks
 from ahoy_core.perceive.overlay import contact_sheet
 from ahoy_core.perceive.perceive import PerceiveConfig, Perception, perceive
@@ -20,6 +21,7 @@ from tasks.model_files import model_path
 from tasks.roles import networks, ours, packaged, packaged_body
 from tasks.stage import Role, Stage, StageContext, StageOutput
 
+FILLABLE = ("pose", "mask", "head")
 MASKS = ("visible", "amodal", "head", "occluded", "box")
 
 
@@ -29,7 +31,9 @@ def run_perceive(config: PerceiveConfig, ctx: StageContext) -> StageOutput:
     body = load_body(ctx.body)
     nets = Networks({name: model_path(name) for name in REQUIRED}, num_threads=torch.get_num_threads())
     K, viewmat = _camera(config, video["frames"].shape[2])
-    found = perceive(video["frames"], video["pts"], video["shot"], K, body, nets, config, ctx.progress, viewmat=viewmat)
+    filled = Filled(*(ctx.fills.get(role) for role in FILLABLE))
+    clip = video["frames"], video["pts"], video["shot"]
+    found = perceive(*clip, K, body, nets, config, ctx.progress, viewmat=viewmat, filled=filled)
     arrays = {f.name: getattr(found, f.name) for f in dataclasses.fields(found) if f.name != "notes"}
     save_npz(ctx.out / "masks.npz", {name: arrays.pop(name) for name in MASKS}, compress=True)
     save_npz(ctx.out / "body.npz", arrays)
@@ -87,4 +91,4 @@ def _roles(config: PerceiveConfig) -> Mapping[str, Role]:
     return {"body": packaged_body(), "pose": seen_by, "mask": seen_by, "head": ours("body's head region"), **learned}
 
 
-PERCEIVE = Stage("perceive", 3, PerceiveConfig, ("ingest",), run_perceive, _roles)
+PERCEIVE = Stage("perceive", 3, PerceiveConfig, ("ingest",), run_perceive, _roles, fillable=FILLABLE)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from ahoy_core.body.load import PACKAGED, body_files
 from ahoy_core.roles import FILLINGS, Perceptual
+from tasks.fills import Fills
 from tasks.model_files import ModelMissingError, list_models, model_path
 from tasks.role import Role
 
@@ -61,8 +62,11 @@ def ours(name: str) -> Role:
     return Role(name, "Apache-2.0")
 
 
-def perceptual_network() -> Perceptual | None:
-    """Who fills the perceptual role: ST-LPIPS where its weights were pulled, else nobody."""
+def perceptual_network(fills: Fills) -> Perceptual | None:
+    """Who fills the perceptual role: the user's choice, else ST-LPIPS where its weights were pulled, else nobody."""
+    chosen: Perceptual | None = fills.get("perceptual")
+    if chosen is not None:
+        return chosen
     try:
         network: Perceptual = FILLINGS["perceptual"]["ST-LPIPS"](model_path(STLPIPS))
     except ModelMissingError:
@@ -71,5 +75,5 @@ def perceptual_network() -> Perceptual | None:
 
 
 def perceptual_role() -> dict[str, Role]:
-    """The role's entry for a stage: empty where nobody fills it, so that pulling the weights changes the key."""
-    return {} if perceptual_network() is None else {"perceptual": networks([STLPIPS])}
+    """The embedded default's entry: empty where its weights are not here, so that pulling them changes the key."""
+    return {} if perceptual_network(Fills()) is None else {"perceptual": networks([STLPIPS])}

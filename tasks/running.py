@@ -63,7 +63,7 @@ def run_stage(stage: Stage, config: BaseModel, inputs: Mapping[str, StageRef | S
             if manifest is None:
                 state = "done"
                 # The lease first: whoever holds a slot never waits for a lease, so nobody waits in a circle.
-                with run.take_slots(stage.slots(config)):
+                with run.take_slots((*stage.slots(config), *run.fills.slots(stage.fillable))):
                     manifest = _make(stage, config, inputs, run, key, hashes, roles, started)
     ref = StageRef(stage.name, key, manifest.content_hash, state, Bill(**manifest.summary["bill"]), stage.item)
     if state == "cached":
@@ -74,7 +74,7 @@ def run_stage(stage: Stage, config: BaseModel, inputs: Mapping[str, StageRef | S
 
 def _filled_by(stage: Stage, config: BaseModel, run: Run) -> dict[str, Role]:
     """Who fills the stage's roles; body and prior are the run's."""
-    filled_by = dict(stage.roles(config))
+    filled_by = run.fills.filled(stage.roles(config), stage.fillable)
     if "body" in filled_by:
         filled_by["body"] = body_role(run.body)
     if "video" in filled_by:
@@ -118,7 +118,7 @@ def _make(
                 run.observer.showed(stage.title, picture)
 
             ctx = StageContext(
-                folders, manifests, attempt.dir, progress, run.body, show, run.prior, stage.item, run.skipped
+                folders, manifests, attempt.dir, progress, run.body, show, run.prior, stage.item, run.skipped, run.fills
             )
             output = stage.run(config, ctx)
             bill = meter.read()
@@ -138,7 +138,8 @@ def _make(
         raise
     row = _row(run, stage, config, key, "done", started, bill) | {"attempt": manifest.attempt}
     run.tables.append("stages", [row], batch=run.batch)
-    _append_results(run, key, output)
+    upstream = {role: who for m in manifests.values() for role, who in m.roles.items()}
+    _append_results(run, key, output, {role: who["name"] for role, who in {**upstream, **roles}.items()})
     return manifest
 
 
@@ -161,10 +162,11 @@ def _resolve(
     return manifests, folders
 
 
-def _append_results(run: Run, key: str, output: StageOutput) -> None:
+def _append_results(run: Run, key: str, output: StageOutput, filled_by: Mapping[str, str]) -> None:
     for table, rows in (("frames", output.frames), ("metrics", output.metrics)):
         if rows:
-            who = {"video_id": run.video_id, "key": key} | ({"capture": run.video_id} if table == "metrics" else {})
+            more = {"capture": run.video_id, "roles": dict(filled_by)} if table == "metrics" else {}
+            who = {"video_id": run.video_id, "key": key} | more
             run.tables.append(table, [{**who, **row} for row in rows], batch=run.batch)
 
 

@@ -20,6 +20,7 @@ from ahoy_core.body.load import PACKAGED
 from ahoy_core.cost.meter import Bill
 from storage_schema.store import ArtifactStore, Manifest
 from storage_schema.tables import Tables
+from tasks.fills import Fills
 from tasks.role import Role as Role
 
 
@@ -65,7 +66,7 @@ class StageOutput:
 
 @dataclass(frozen=True)
 class StageContext:
-    """Where a stage's function finds its inputs and puts its outputs, and which body and prior fill those roles.
+    """Where a stage's function finds its inputs and puts its outputs, and who fills the roles.
 
     `item` is which of its items a mapped stage is at; `skipped` says, to a stage that explains, what was left out.
     """
@@ -79,6 +80,7 @@ class StageContext:
     prior: str = PACKAGED
     item: str = ""
     skipped: Mapping[str, str] = field(default_factory=dict)
+    fills: Fills = field(default_factory=Fills)
 
 
 @dataclass(frozen=True)
@@ -99,6 +101,7 @@ class Stage:
         item: the item that this is made for; empty for a stage that is not mapped.
         obstacle: says why it has to be skipped, from the run and the summaries of its inputs; empty where it may run.
         explains: its output tells what was skipped and why, so its key knows.
+        fillable: roles that `roles.yaml` may fill otherwise than `roles` says.
     """
 
     name: str
@@ -113,6 +116,7 @@ class Stage:
     item: str = ""
     obstacle: Callable[[Run, Mapping[str, Mapping[str, Any]]], str] | None = None
     explains: bool = False
+    fillable: tuple[str, ...] = ()
 
     @property
     def title(self) -> str:
@@ -163,7 +167,7 @@ class Source:
 
 @dataclass(frozen=True)
 class Run:
-    """One attempt at one video: where its artifacts and rows go, who watches, and which body and prior are used.
+    """One attempt at one video: where its artifacts and rows go, who watches, and who fills the roles.
 
     Attributes:
         body: a name or the path of a file; keys know it by its contents alone, so it is no knob of a stage.
@@ -172,6 +176,7 @@ class Run:
         take_slots: waits for one slot of each named resource and holds them while its block runs.
         attempt_number: of the video in its batch, from 1.
         sequence: numbers the rows of this run, so that their order does not rest on a clock.
+        fills: roles that something else than the embedded default fills.
     """
 
     store: ArtifactStore
@@ -186,3 +191,4 @@ class Run:
     sequence: Iterator[int] = field(default_factory=itertools.count)
     prior: str = PACKAGED
     skipped: Mapping[str, str] = field(default_factory=dict)
+    fills: Fills = field(default_factory=Fills)

@@ -11,10 +11,13 @@ import numpy as np
 from ahoy_core.body.load import load_body
 from ahoy_core.formats.images import contact_sheet, write_png
 from ahoy_core.formats.npz import load_npz, save_npz
+from ahoy_core.texture.by_roles import agreement, complete_by, parts_by
+from ahoy_core.texture.surface import Surface
 from ahoy_core.texture.texture import Texture, TextureConfig, build_texture
 from tasks.roles import ours, packaged_body
 from tasks.stage import Role, Stage, StageContext, StageOutput
 
+FILLABLE = ("surface", "inpaint", "views")
 SHOWN = 5  # rejected frames named in the report
 GREY = 128  # canonical views are shown over the grey that everything else is composited on
 
@@ -22,10 +25,18 @@ GREY = 128  # canonical views are shown over the grey that everything else is co
 def run_texture(config: TextureConfig, ctx: StageContext) -> StageOutput:
     """Build the texture and the pictures of it."""
     frames = load_npz(ctx.inputs["ingest"] / "frames.npz", ["frames"])["frames"]
-    visible = load_npz(ctx.inputs["perceive"] / "masks.npz", ["visible"])["visible"]
+    masks = load_npz(ctx.inputs["perceive"] / "masks.npz", ["visible", "box"])
     fit = load_npz(ctx.inputs["perceive"] / "body.npz")
     body = load_body(ctx.body)
-    texture = build_texture(frames, visible, fit, body, config, lambda done, total: ctx.progress(done, total, "frames"))
+    more: dict[str, Any] = {}
+    if (dense := ctx.fills.get("surface")) is not None:
+        more["checked"] = agreement(Surface.of(body), parts_by(dense, frames, masks["box"], fit["used"]))
+
+    def report(done: int, total: int) -> None:
+        ctx.progress(done, total, "frames")
+
+    texture = build_texture(frames, masks["visible"], fit, body, config, report, **more)
+    texture = complete_by(texture, ctx.fills.get("inpaint"), ctx.fills.get("views"))
     save_npz(ctx.out / "atlas.npz", texture.atlas_arrays(), compress=True)
     save_npz(ctx.out / "canonical.npz", texture.canonical_arrays(), compress=True)
     (ctx.out / "texture.json").write_text(json.dumps(texture.notes, indent=1), encoding="utf-8")
@@ -76,4 +87,4 @@ def _roles(config: TextureConfig) -> Mapping[str, Role]:
     }
 
 
-TEXTURE = Stage("texture", 2, TextureConfig, ("ingest", "perceive"), run_texture, _roles)
+TEXTURE = Stage("texture", 2, TextureConfig, ("ingest", "perceive"), run_texture, _roles, fillable=FILLABLE)

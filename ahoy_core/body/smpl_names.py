@@ -28,6 +28,11 @@ _SIDED: Final = {"hip": "upperleg01", "knee": "lowerleg01", "ankle": "foot", "fo
                  "shoulder": "upperarm01", "elbow": "lowerarm01", "wrist": "wrist", "eye_smplhf": "eye"}  # fmt: skip
 # The SMPL family's one joint of the toes moves all of the packaged body's.
 _TOES: Final = tuple(f"toe{k}-1" for k in range(1, 6))
+_TRUNK: Final = {"spine1": "pelvis", "spine2": "spine1", "spine3": "spine2", "neck": "spine3", "head": "neck",
+                 "jaw": "head"}  # fmt: skip
+_ABOVE: Final = {"hip": "pelvis", "knee": "hip", "ankle": "knee", "foot": "ankle", "collar": "spine3",
+                 "shoulder": "collar", "elbow": "shoulder", "wrist": "elbow", "hand": "wrist",
+                 "eye_smplhf": "head"}  # fmt: skip
 # Rest poses differ in arms and legs alone: everybody's trunk stands upright and everybody's soles are flat, whatever
 # the slope of the bones that run through them.
 _LIMBS: Final = ("hip", "knee", "shoulder", "elbow", "wrist")
@@ -66,6 +71,18 @@ def within_smpl(target_names: tuple[str, ...], source_names: tuple[str, ...]) ->
         if f"{side}_hand" in source_names and f"{side}_middle1" in target_names:
             pairs |= {f"{side}_{finger}1": f"{side}_hand" for finger in _FINGERS if finger != "thumb"}
     return pairs
+
+
+def smpl_parents(names: tuple[str, ...]) -> tuple[int, ...]:
+    """Parent of each joint of `JOINT_NAMES`, -1 for the root: the family's tree, which their files hold as well."""
+    found = [-1]
+    for name in names[1:]:
+        side, _, part = name.partition("_")
+        above = _TRUNK.get(name) or _ABOVE.get(part)
+        if above is None:
+            above = "wrist" if part.endswith("1") else f"{part[:-1]}{int(part[-1]) - 1}"
+        found.append(names.index(above if above in names else f"{side}_{above}"))
+    return tuple(found)
 
 
 def is_limb(name: str) -> bool:

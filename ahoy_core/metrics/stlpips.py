@@ -26,7 +26,7 @@ _CONVS = (
 )
 _BLUR = (1.0, 2.0, 1.0)
 # Mean and spread of natural pictures in [-1,1], as LPIPS centres its input.
-_SHIFT, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
+SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 
 
 class StLpips(nn.Module):
@@ -50,20 +50,16 @@ class StLpips(nn.Module):
         Raises:
             ValueError: If the shapes differ or a side is too short.
         """
-        if a.shape != b.shape or a.ndim != 4 or a.shape[1] != 3 or min(a.shape[2:]) < MIN_SIDE:
-            raise ValueError(
-                f"expected two pictures [B,3,H,W] of one size, sides of {MIN_SIDE} or more, got {tuple(a.shape)} and "
-                f"{tuple(b.shape)}; cut out larger patches"
-            )
+        check_pictures(a, b, MIN_SIDE)
         total = a.new_zeros(len(a))
         for first, second, head in zip(self.features(a), self.features(b), self.heads, strict=True):
-            difference = (_normalised(first) - _normalised(second)).square()
+            difference = (normalised(first) - normalised(second)).square()
             total = total + (difference * head.to(a)).sum(1).mean((1, 2))
         return total
 
     def features(self, image: Tensor) -> list[Tensor]:
         """Activations of the five convolutions for [B,3,H,W] in [0,1]."""
-        shift, scale = (image.new_tensor(values)[:, None, None] for values in (_SHIFT, _SCALE))
+        shift, scale = (image.new_tensor(values)[:, None, None] for values in (SHIFT, SCALE))
         x = relu(_blur_pool(self.convs[0]((2 * image - 1 - shift) / scale)))
         out = [x]
         for number, conv in enumerate(self.convs):
@@ -76,7 +72,21 @@ class StLpips(nn.Module):
         return out
 
 
-def _normalised(features: Tensor) -> Tensor:
+def check_pictures(a: Tensor, b: Tensor, side: int) -> None:
+    """Refuse what is no pair of pictures [B,3,H,W] of one size with sides of `side` pixels or more.
+
+    Raises:
+        ValueError: naming both shapes.
+    """
+    if a.shape != b.shape or a.ndim != 4 or a.shape[1] != 3 or min(a.shape[2:]) < side:
+        raise ValueError(
+            f"expected two pictures [B,3,H,W] of one size, sides of {side} or more, got {tuple(a.shape)} and "
+            f"{tuple(b.shape)}; cut out larger patches"
+        )
+
+
+def normalised(features: Tensor) -> Tensor:
+    """Features [B,C,h,w] of length 1 in every pixel (0 where there are none)."""
     # The square root has no gradient at 0, where all features of a flat patch may lie.
     return features / ((features.square().sum(1, keepdim=True) + 1e-12).sqrt() + 1e-10)
 

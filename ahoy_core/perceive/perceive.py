@@ -15,6 +15,7 @@ from ahoy_core.body.regions import faces_within
 from ahoy_core.conventions import OBSERVED_VIEWMAT
 from ahoy_core.perceive.config import PerceiveConfig
 from ahoy_core.perceive.face import FaceReading, expressions, read_face
+from ahoy_core.perceive.filled import Filled, fit_by, heads_by, masks_by, subject_boxes
 from ahoy_core.perceive.fit import fit_body
 from ahoy_core.perceive.head import head_mask
 from ahoy_core.perceive.landmarks import LandmarkTrack, run_landmarks
@@ -34,6 +35,7 @@ Progress = Callable[[int, int, str], None]
 # Shares of the stage's time, for one progress bar over its parts; in thousandths.
 BAR = 1000
 BAR_LANDMARKS, BAR_MASKS, BAR_FIT = 500, 600, 900
+EMBEDDED = Filled()
 NOSE, SEEN_NOSE = 0, 0.5  # the landmark and its visibility from which a face is looked for
 
 
@@ -47,6 +49,7 @@ def perceive(
     config: PerceiveConfig,
     progress: Progress | None = None,
     viewmat: NDArray[np.floating] | None = None,
+    filled: Filled = EMBEDDED,
 ) -> Perception:
     """Find the subject, fit the body over the whole clip, and cut the person out.
 
@@ -61,6 +64,7 @@ def perceive(
         progress: called with thousandths done, 1000, and a note.
         viewmat: [4,4] where a still camera stands, if known: from a world with z up and the floor at z = 0. The result
             stays in the axes of `OBSERVED_VIEWMAT`.
+        filled: models that fill roles instead of the embedded defaults.
 
     Raises:
         ValueError: arrays of other shapes than stated.
@@ -86,24 +90,26 @@ def perceive(
     intrinsics = assumed_intrinsics(height, width, config.fov_degrees) if K is None else np.asarray(K, np.float64)
     used = np.zeros(n, np.bool_)
     used[looked[track.found]] = True
-    soft = np.zeros((n, height, width), np.uint8)
-    for row, t in enumerate(looked.tolist()):
-        roi = track.rois[row]
-        if roi is not None:
-            mask = track.mask(row, height, width)
-            soft[t] = refine(frames[t], mask, roi.size) if config.mask_refinement else np.round(255 * mask)
-        report(BAR_LANDMARKS + (BAR_MASKS - BAR_LANDMARKS) * (row + 1) // len(looked), BAR, "cutting the person out")
-    if config.mask_refinement:
-        soft[used] = hold_static(frames[used], soft[used], shots[used])
+    boxes = subject_boxes(track, looked, n, height, width)
+
+    def cutting(done: int, total: int) -> None:
+        report(BAR_LANDMARKS + (BAR_MASKS - BAR_LANDMARKS) * done // total, BAR, "cutting the person out")
+
+    if filled.mask is not None:
+        cutting(0, 1)
+        soft = masks_by(filled.mask, frames, boxes, shots)
+    else:
+        soft = _soft_masks(frames, track, looked, used, shots, config, cutting)
     seen = observations(track, pts[looked], shots[looked], intrinsics, viewmat, config)
     knobs = FitConfig(iterations=config.iterations, smoothing=config.smoothing, outline=config.outline)
-    fit = fit_body(
-        body,
-        seen,
-        knobs,
-        lambda done, total, note: report(BAR_MASKS + (BAR_FIT - BAR_MASKS) * done // total, BAR, note),
-        soft[used],
-    )
+
+    def fitting(done: int, total: int, note: str) -> None:
+        report(BAR_MASKS + (BAR_FIT - BAR_MASKS) * done // total, BAR, note)
+
+    if filled.pose is not None:
+        fit = fit_by(filled.pose, frames[used], boxes[used], body, seen, fitting)
+    else:
+        fit = fit_body(body, seen, knobs, fitting, soft[used])
     pose, transl = spread_poses(fit.pose, fit.transl, used, pts, shots)
     faces = _faces(networks, frames, track, looked, body.n_expressions)
     head = faces_within(body.faces, body.regions["head"]).numpy()
@@ -112,13 +118,37 @@ def perceive(
         with torch.no_grad():
             vertices = body(pose[t][None], fit.betas[None], transl[t][None]).vertices[0].numpy()
         masks.append(frame_masks(soft[t], silhouette(vertices, body.faces.numpy(), intrinsics, height, width)))
-        if used[t]:
+        if used[t] and filled.head is None:
             seen_from = to_camera(vertices, OBSERVED_VIEWMAT.numpy())
             heads[t] = head_mask(seen_from, body.faces.numpy(), head, intrinsics, masks[t].visible)
         report(BAR_FIT + (BAR - BAR_FIT) * (t + 1) // n, BAR, "drawing the silhouettes")
+    if filled.head is not None:
+        heads[used] = heads_by(filled.head, frames[used], np.stack([m.visible for m in masks])[used])
     read = int((faces[1] > 0).sum())
     notes = make_notes(config, track, fit, used, masks, intrinsics, (height, width), K is not None, read)
     return assemble_result(body, track, fit, used, looked, pose, transl, masks, heads, faces, intrinsics, notes)
+
+
+def _soft_masks(
+    frames: NDArray[np.uint8],
+    track: LandmarkTrack,
+    looked: NDArray[np.int64],
+    used: NDArray[np.bool_],
+    shots: NDArray[np.integer],
+    config: PerceiveConfig,
+    report: Callable[[int, int], None],
+) -> NDArray[np.uint8]:
+    """The embedded role "mask": the landmark network's, with edges moved to the picture's, [T,H,W], 0 to 255."""
+    soft = np.zeros(frames.shape[:3], np.uint8)
+    for row, t in enumerate(looked.tolist()):
+        roi = track.rois[row]
+        if roi is not None:
+            mask = track.mask(row, *frames.shape[1:3])
+            soft[t] = refine(frames[t], mask, roi.size) if config.mask_refinement else np.round(255 * mask)
+        report(row + 1, len(looked))
+    if config.mask_refinement:
+        soft[used] = hold_static(frames[used], soft[used], shots[used])
+    return soft
 
 
 def _faces(

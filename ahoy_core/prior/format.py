@@ -86,7 +86,7 @@ def load_components(folder: Path, dtype: torch.dtype = torch.float32) -> Compone
     Raises:
         PriorFormatError: when the folder is something else.
     """
-    index = _index(folder)
+    index = read_index(folder)
     options = {"torch_dtype": dtype, "local_files_only": True}
     from diffusers import WanTransformer3DModel
 
@@ -119,7 +119,12 @@ def _without_bars() -> Iterator[None]:
             logging.enable_progress_bar()
 
 
-def _index(folder: Path) -> dict[str, Any]:
+def read_index(folder: Path) -> dict[str, Any]:
+    """The `model_index.json` of a Wan pipeline's folder.
+
+    Raises:
+        PriorFormatError: when the folder is something else.
+    """
     path = folder / "model_index.json"
     if not path.is_file():
         raise PriorFormatError(

@@ -51,7 +51,10 @@ class Look:
 
 @dataclass(frozen=True)
 class Clip:
-    """Frames [T,H,W,3] uint8, visible masks [T,H,W] uint8, the arrays of body.npz, the body and the knobs."""
+    """Frames [T,H,W,3] uint8, visible masks [T,H,W] uint8, the arrays of body.npz, the body and the knobs.
+
+    `checked` takes back a frame's trust where somebody else sees another surface than the fitted body's.
+    """
 
     frames: IntArray
     visible: IntArray
@@ -59,6 +62,7 @@ class Clip:
     body: BodyModel
     surface: Surface
     config: TextureConfig
+    checked: Callable[[int, SeenFrame], SeenFrame] = lambda number, seen: seen
 
 
 def accumulate(
@@ -134,12 +138,14 @@ def _looks(clip: Clip, atlas: AtlasAccumulator, numbers: list[int]) -> Iterator[
         grazing, boundary = config.grazing_cos, config.boundary_px
         view = clip.fit["viewmat"]
         seen = look(clip.surface, vertices, view, K, visible, grazing_cos=grazing, boundary_px=boundary)
+        seen = clip.checked(t, seen)
         exposure = atlas.exposure(image, seen, config.exposure)
         image = image if exposure is None else exposure.apply(image)
         reach = config.align_px * height_in_pixels(seen.hits) / REFERENCE_HEIGHT
         shift = atlas.shift(image, seen, reach)
         if shift != (0.0, 0.0):
             seen = trust(clip.surface, seen.caster, _shifted(K, shift), visible, grazing, boundary)
+            seen = clip.checked(t, seen)
         yield Look(t, seen, image, shift, exposure)
 
 

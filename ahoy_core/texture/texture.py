@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +17,7 @@ from ahoy_core.texture.canonical import canonical_views
 from ahoy_core.texture.fill import FilledAtlas, fill_atlas
 from ahoy_core.texture.inputs import TextureConfig, check_inputs, choose_frames
 from ahoy_core.texture.rays import BoolArray, FloatArray, IntArray
-from ahoy_core.texture.surface import Surface
+from ahoy_core.texture.surface import SeenFrame, Surface
 from ahoy_core.texture.texels import TexelMap, texel_map
 
 FILL_WORDS = {
@@ -68,6 +68,7 @@ def build_texture(
     config: TextureConfig,
     progress: Progress | None = None,
     canonical: FloatArray | None = None,
+    checked: Callable[[int, SeenFrame], SeenFrame] = lambda number, seen: seen,
 ) -> Texture:
     """Accumulate the atlas over the frames, complete it, and view the textured body in canonical pose.
 
@@ -80,6 +81,7 @@ def build_texture(
         config: knobs.
         progress: called with frames done and frames in all, of both passes.
         canonical: [V,3] the fitted shape in the canonical pose theta_*; `canonical_vertices` by default.
+        checked: see `ahoy_core.texture.accumulate.Clip`.
 
     Raises:
         ValueError: where shapes disagree, or an array is missing.
@@ -90,7 +92,7 @@ def build_texture(
     chosen, rejected = choose_frames(fit["used"], fit["frame_confidence"], config)
     vertices = canonical_vertices(body, fit["betas"]) if canonical is None else canonical
     points = texels.points(vertices, surface.faces)
-    clip = Clip(frames, visible, fit, body, surface, config)
+    clip = Clip(frames, visible, fit, body, surface, config, checked)
     observed, log = accumulate(clip, texels, points, chosen, progress)
     filled = fill_atlas(observed, surface, texels, vertices, config.fill)
     rendered = canonical_views(

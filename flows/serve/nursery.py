@@ -172,10 +172,32 @@ def _exactly(connection: socket.socket, size: int) -> bytes:
     return data
 
 
+def load_models() -> None:
+    """Load once, for all runs to come, the models of `roles.yaml` that work on the CPU; forks share their memory.
+
+    One thread loads: OpenMP's threads do not survive a fork. What cannot be loaded is the run's to complain of, whose
+    stage then says why.
+    """
+    import torch
+
+    from ahoy_core.models.errors import ModelError
+    from tasks.fills import fills_from_environment
+
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        fills_from_environment().preload()
+    except ModelError as error:
+        print(f"not loaded beforehand: {error}", file=sys.stderr)
+    finally:
+        torch.set_num_threads(threads)
+
+
 def main() -> None:
-    """Import, say that it is ready, serve."""
+    """Import, load models, say that it is ready, serve."""
     for name in PRELOADED:
         __import__(name)
+    load_models()
     nursery = Nursery(sys.argv[1], run_engine)
     os.write(sys.stdout.fileno(), READY)
     nursery.serve()

@@ -51,7 +51,7 @@ def evaluate_stage(capture: Capture, every: int | None, needs: tuple[str, ...], 
         return _run(config, ctx, Truths(capture, fitted, config.size, every), make(ctx, capture, fitted))
 
     inputs = ("capture", "ingest", "perceive", *needs)
-    return Stage("evaluate", VERSION, EvaluateConfig, inputs, run, _roles)
+    return Stage("evaluate", VERSION, EvaluateConfig, inputs, run, _roles, fillable=("perceptual",))
 
 
 def avatar_renderer(ctx: StageContext, capture: Capture, fitted: Fitted) -> Renderer:
@@ -65,7 +65,7 @@ def reference_renderer(name: str) -> MakeRenderer:
 
 
 def _run(config: EvaluateConfig, ctx: StageContext, truths: Truths, renderer: Renderer) -> StageOutput:
-    network = perceptual_network()
+    network = perceptual_network(ctx.fills)
     shots, notes = _shots(config, truths)
     rows: list[dict[str, Any]] = []
     kept: list[tuple[Shot, np.ndarray]] = []

@@ -92,10 +92,12 @@ OPTIONAL: dict[str, dict[str, Any]] = {
         "perceptual_name": "net",
         "iou": 1.0,
         "input_setting": "video",
+        "roles": {"pose": "net"},
     },
 }
 STORED = {
     "knobs": '{"a":[1,null],"b":0.1}',
+    "roles": '{"pose":"net"}',
     "accuracy": '{"px":3.5}',
     "options": '{"subject":1}',
     "pose": [0, 1, 2, 3, 4, 5],

@@ -57,6 +57,15 @@ def test_stages_of_version_1_get_an_order_and_keep_everything_else(store: Artifa
     assert second["stage"] == "perceive"
 
 
+def test_metrics_of_version_1_say_nothing_of_roles_and_keep_everything_else(store: ArtifactStore) -> None:
+    now = TABLES["metrics"]
+    columns = pa.schema([column for column in now.columns if column.name != "roles"])
+    Tables(store, {"metrics": TableSchema("metrics", 1, columns)}).append("metrics", [REQUIRED["metrics"]], batch="b")
+    assert Tables(store).read("metrics", "b").to_pylist() == [
+        {"batch": "b", **dict.fromkeys(now.columns.names), **REQUIRED["metrics"]}
+    ]
+
+
 def test_rows_of_older_versions_are_rewritten_in_place_once(store: ArtifactStore) -> None:
     old = Tables(store, {"toy": V1})
     old.append("toy", [{"name": "old", "seconds": 3}], batch="b")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +15,7 @@ from flows.pipeline import Outcome, process
 from storage_schema.artifacts import Blob
 from storage_schema.store import ArtifactStore
 from storage_schema.tables import Tables
+from tasks.role import Role
 from tasks.running import run_stage
 from tasks.stage import Run, Source, Stage, StageContext, StageOutput, StageRef
 
@@ -165,3 +167,16 @@ def test_a_missing_input_is_named(pipeline: Pipeline) -> None:
     run = Run(pipeline.store, pipeline.tables, "b", "v", "r", Silent())
     with pytest.raises(ValueError, match="run those stages first"):
         run_stage(pipeline.stages[1], Knobs(), {}, run)
+
+
+def test_a_metric_row_says_who_filled_the_roles_of_its_stage_and_of_those_before(tmp_path: Path) -> None:
+    pipeline = Pipeline(tmp_path)
+    named = {"first": {"pose": Role("NLF", "MIT")}, "second": {"perceptual": Role("LPIPS", "BSD")}}
+    pipeline.stages = tuple(
+        dataclasses.replace(stage, roles=lambda config, name=stage.name: named.get(name, {}))
+        for stage in pipeline.stages
+    )
+    run = Run(pipeline.store, pipeline.tables, "b", "v", "r", Silent())
+    process(pipeline.source, Toy(), run, stages=pipeline.stages)  # type: ignore[arg-type]
+    rows = [json.loads(row["roles"]) for row in pipeline.tables.read("metrics", "b").to_pylist()]
+    assert rows == [{"pose": "NLF"}, {"pose": "NLF", "perceptual": "LPIPS"}, {"pose": "NLF"}]

@@ -1,0 +1,177 @@
+"""What an adapter declares of itself, and how a configuration chooses one. Importing this imports no model library."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from ahoy_core.models.errors import CheckpointError, MissingPackageError, ModelError, UntrustedCodeError
+
+DType = Literal["float32", "bfloat16", "float16"]
+DISTRIBUTION = "ahoy-avatars"
+
+
+class Fill(BaseModel):
+    """Who fills a role: one entry of `roles.yaml`.
+
+    Attributes:
+        fill: name of an adapter of that role.
+        path: the model's file or folder on the machine that runs it.
+        device: "cpu", "cuda", "cuda:1"; "auto" is cuda where there is one.
+        dtype: of the weights; by default the adapter's own. States of solvers and results stay float32.
+        trust_code: the file at `path` is a program (TorchScript) and may be run.
+        command: an external command, as a list of words (no shell reads it).
+        timeout_s: seconds that one call of the command may take.
+        options: knobs of the adapter.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    fill: str
+    path: Path | None = None
+    device: str = Field(default="auto", pattern=r"^(auto|cpu|cuda(:\d+)?)$")
+    dtype: DType | None = None
+    trust_code: bool = False
+    command: tuple[str, ...] = ()
+    timeout_s: float = Field(default=3600.0, gt=0)
+    options: dict[str, Any] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _absolute(self) -> Fill:
+        if self.path is not None and str(self.path).startswith("~"):
+            object.__setattr__(self, "path", self.path.expanduser())
+        return self
+
+
+@dataclass(frozen=True)
+class ExpectedFile:
+    """A file of a checkpoint.
+
+    Attributes:
+        name: relative to the model's folder, or a pattern; "" where `path` is the file itself.
+        what: in a few words.
+        sha256: where its publisher or a registry states it; a shorter one is a prefix (torchvision's file names).
+    """
+
+    name: str
+    what: str
+    sha256: str = ""
+
+
+@dataclass(frozen=True)
+class Adapter:
+    """A model that can fill a role, as a lawyer and an operator need to know it.
+
+    Attributes:
+        role: of `ahoy_core.roles`.
+        name: what `fill` says.
+        title: what reports call it.
+        licence: of weights and code, short.
+        commercial: whether the licence allows commercial use: "yes", "no", or "conditions" (read it).
+        licence_at: where its text is.
+        source: where its owner gets the files.
+        files: what has to be there.
+        parameters: billions, as published; 0 where there are none or they are not published.
+        dtype: of the weights by default.
+        device: "cpu" where a CPU is enough, else "cuda".
+        load: "module:function" that takes a `Fill` and returns the role's object.
+        extra: of this project that installs what it needs; None where nothing is needed.
+        packages: modules that extra brings.
+        endings: of the file's name, where the checkpoint is one file.
+        is_code: the checkpoint is a program.
+        is_command: it runs as an external command.
+    """
+
+    role: str
+    name: str
+    title: str
+    licence: str
+    commercial: Literal["yes", "no", "conditions"]
+    licence_at: str
+    source: str
+    files: tuple[ExpectedFile, ...]
+    load: str
+    parameters: float = 0.0
+    dtype: DType = "float32"
+    device: Literal["cpu", "cuda"] = "cpu"
+    extra: str | None = None
+    packages: tuple[str, ...] = ()
+    endings: tuple[str, ...] = ()
+    is_code: bool = False
+    is_command: bool = False
+
+    @property
+    def label(self) -> str:
+        """`role=name`, as configurations and messages say it."""
+        return f"{self.role}={self.name}"
+
+    def weights_gib(self, dtype: DType | None = None) -> float:
+        """Memory of the weights alone: published parameters times the size of one."""
+        return self.parameters * 1e9 * (4 if (dtype or self.dtype) == "float32" else 2) / 2**30
+
+    def require(self, fill: Fill) -> None:
+        """Refuse what cannot work, before anything heavy is imported.
+
+        Raises:
+            MissingPackageError: an optional package is missing.
+            CheckpointError: no path, or a file that is not there.
+            UntrustedCodeError: the file is a program and nobody said that it may run.
+            ModelError: a command is asked for and none is given.
+        """
+        absent = [name for name in self.packages if importlib.util.find_spec(name) is None]
+        if absent:
+            raise MissingPackageError(
+                f"{self.label} needs {', '.join(absent)}, not installed here; "
+                f"pip install '{DISTRIBUTION}[{self.extra}]'"
+            )
+        if self.is_command and not fill.command:
+            raise ModelError(f"{self.label} runs as an external command, got none; add command: [...] to roles.yaml")
+        if not self.is_command or fill.path is not None:
+            self._require_files(fill)
+        if self.is_code and not fill.trust_code:
+            raise UntrustedCodeError(
+                f"{self.label}: {fill.path} is TorchScript, a program that runs with your rights; if you trust where "
+                "it comes from, say trust_code: true in roles.yaml (or --trust-code)"
+            )
+
+    def fits(self, path: Path) -> bool:
+        """Whether a path looks like this adapter's checkpoint: its names are there, or its ending is the right one."""
+        if self.endings:
+            return path.is_file() and path.suffix in self.endings
+        return path.is_dir() and all(_found(path, file.name) for file in self.files)
+
+    def _require_files(self, fill: Fill) -> None:
+        if fill.path is None:
+            raise CheckpointError(f"{self.label}: expected a path, got none; {self.how_to_get()}")
+        if not fill.path.exists():
+            raise CheckpointError(f"{self.label}: nothing is at {fill.path}; {self.how_to_get()}")
+        missing = [f.name for f in self.files if f.name and not any(_found(fill.path, f.name))]
+        if missing:
+            raise CheckpointError(f"{self.label}: {fill.path} lacks {', '.join(missing)}; {self.how_to_get()}")
+
+    def how_to_get(self) -> str:
+        """Where the right file is, for the end of an error."""
+        return f"get it from {self.source}"
+
+    def open(self, fill: Fill) -> Any:
+        """Check what the configuration gives, then load the model.
+
+        Raises:
+            ModelError: see `require`, or the checkpoint is another model's.
+        """
+        self.require(fill)
+        module, _, function = self.load.partition(":")
+        loader: Callable[[Fill, Adapter], Any] = getattr(importlib.import_module(module), function)
+        return loader(fill, self)
+
+
+def _found(path: Path, name: str) -> list[Path]:
+    """Files of a checkpoint's folder that a name or pattern stands for; alternatives are parted by `|`."""
+    folder = path if path.is_dir() else path.parent
+    return [found for alternative in name.split("|") for found in folder.glob(alternative)]

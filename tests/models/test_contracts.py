@@ -1,0 +1,225 @@
+"""One contract a role, over everything that can fill it: the embedded default and the real models on tiny checkpoints.
+
+Shapes, ranges, dtypes, the same answer under the same seed, empty and single-frame input.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from ahoy_core.body.packaged import load_packaged_body
+from ahoy_core.conventions import Cameras, look_at, orbit_eyes, perspective_K
+from ahoy_core.metrics.stlpips import StLpips
+from ahoy_core.models.adapter import Fill
+from ahoy_core.models.catalogue import ADAPTERS, adapter
+from ahoy_core.prior.conditioning import Context
+from ahoy_core.texture.canonical import CanonicalViews
+from ahoy_core.texture.fillings import TexturedBody
+from tests.models.checkpoints import build
+
+H, W = 72, 56
+Load = Callable[[str, str], Any]
+
+
+@pytest.fixture(scope="module")
+def load(tmp_path_factory: pytest.TempPathFactory) -> Load:
+    """Builds and loads each adapter once."""
+    loaded: dict[tuple[str, str], Any] = {}
+
+    def once(role: str, name: str) -> Any:
+        if (role, name) not in loaded:
+            fill = build(role, name, tmp_path_factory.mktemp(f"{role}-{name}"))
+            loaded[role, name] = adapter(role, name).open(fill)
+        return loaded[role, name]
+
+    return once
+
+
+@pytest.fixture(scope="module")
+def sam3(tmp_path_factory: pytest.TempPathFactory) -> Fill:
+    """One checkpoint for both modes."""
+    return build("mask", "sam3", tmp_path_factory.mktemp("sam3"))
+
+
+def names(role: str, *embedded: str) -> list[str]:
+    return [*embedded, *(each.name for each in ADAPTERS if each.role == role)]
+
+
+def frames(count: int) -> Tensor:
+    return torch.rand(count, 3, H, W, generator=torch.Generator().manual_seed(5))
+
+
+def boxes(count: int) -> Tensor:
+    """The subject over the middle, not there in the second frame."""
+    found = torch.tensor([[0.25 * W, 0.0, 0.75 * W, float(H)]]).repeat(count, 1)
+    found[1:2] = float("nan")
+    return found
+
+
+def same(first: Any, second: Any) -> bool:
+    return all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
+
+
+@pytest.mark.parametrize("name", names("body", "packaged"))
+def test_body(name: str, load: Load) -> None:
+    body = load_packaged_body() if name == "packaged" else load("body", name)
+    for count in (0, 1, 2):
+        out = body(torch.zeros(count, body.n_joints, 3), body.default_betas[None], torch.zeros(count, 3))
+        assert out.vertices.shape == (count, len(body.lbs_weights), 3) and out.joints.shape == (count, body.n_joints, 3)
+        assert out.vertices.dtype == torch.float32 and bool(torch.isfinite(out.vertices).all())
+    # Metres, z up, facing -y: a person is between one and two and a half metres tall.
+    assert 1.0 < float(out.vertices[0, :, 2].amax() - out.vertices[0, :, 2].amin()) < 2.5
+
+
+@pytest.mark.parametrize("name", names("pose"))
+def test_pose(name: str, load: Load) -> None:
+    role, K = load("pose", name), perspective_K(0.9, W, H)
+    for count in (0, 1, 3):
+        found = role(frames(count), K, boxes(count))
+        joints = found.pose.shape[1]
+        assert found.pose.shape == found.joints.shape == (count, joints, 3)
+        assert found.uncertainty.shape == (count, joints) and found.betas.shape[0] == count
+        assert found.pose.dtype == found.joints.dtype == torch.float32 and found.found.dtype == torch.bool
+        assert found.found.tolist() == [True, False, True][:count]
+        # Metres in front of the camera; what was not looked for is zero.
+        assert count == 0 or 0.5 < float(found.joints[0, :, 2].mean()) < 20
+        assert not bool(found.joints[1:2].any())
+    assert same([found.pose, found.joints], [(again := role(frames(3), K, boxes(3))).pose, again.joints])
+
+
+@pytest.mark.parametrize("mode", ["image", "video"])
+@pytest.mark.parametrize("name", names("mask"))
+def test_mask(name: str, mode: str, sam3: Fill) -> None:
+    role = adapter("mask", name).open(sam3.model_copy(update={"options": {**sam3.options, "mode": mode}}))
+    for count in (0, 1, 3):
+        masks = role(frames(count), boxes(count))
+        assert masks.shape == (count, 1, H, W) and masks.dtype == torch.float32
+        assert count == 0 or (float(masks.min()) >= 0 and float(masks.max()) <= 1)
+        assert mode == "video" or count == 0 or float(masks[0].max()) > 0  # an untrained tracker may lose everybody
+        assert mode == "video" or not bool(masks[1:2].any())
+    assert torch.equal(masks, role(frames(3), boxes(3)))
+    nowhere = torch.full((2, 4), float("nan"))
+    assert not bool(role(frames(2), nowhere).any())
+
+
+@pytest.mark.parametrize("name", names("surface"))
+def test_surface(name: str, load: Load) -> None:
+    role = load("surface", name)
+    for count in (0, 1, 3):
+        found = role(frames(count), boxes(count))
+        assert found.part.shape == (count, H, W) and found.part.dtype == torch.uint8
+        assert found.uv.shape == (count, 2, H, W) and found.uv.dtype == torch.float32
+        assert count == 0 or (0 < int(found.part.max()) <= 24 and float(found.uv.min()) >= 0)
+        assert count == 0 or float(found.uv.max()) <= 1
+        assert not bool(found.uv[(found.part == 0)[:, None].expand_as(found.uv)].any())
+        assert not bool(found.part[1:2].any())
+    assert same([found.part, found.uv], [(again := role(frames(3), boxes(3))).part, again.uv])
+
+
+@pytest.mark.parametrize("name", names("head"))
+def test_head(name: str, load: Load) -> None:
+    role = load("head", name)
+    for count in (0, 1, 3):
+        masks = torch.zeros(count, 1, H, W)
+        masks[:, :, 5:70, 10:40] = 0.8
+        masks[1:2] = 0
+        heads = role(frames(count), masks)
+        assert heads.shape == masks.shape and heads.dtype == torch.float32
+        assert bool((heads >= 0).all()) and bool((heads <= masks + 1e-6).all())
+        assert count == 0 or float(heads[0].max()) > 0
+    assert torch.equal(heads, role(frames(3), masks))
+    assert not bool(role(frames(1), torch.zeros(1, 1, H, W)).any())
+
+
+def textured_body() -> TexturedBody:
+    views = (255 * torch.rand(4, H, W, 4, generator=torch.Generator().manual_seed(1))).byte().numpy()
+    cameras = Cameras(torch.eye(4).expand(4, 4, 4), torch.eye(3).expand(4, 3, 3), W, H, "ortho")
+    return TexturedBody(CanonicalViews(views, views[..., 3], views[0], cameras))
+
+
+def hole() -> Tensor:
+    mask = torch.zeros(1, H, W)
+    mask[:, 20:60, 15:40] = 1
+    return mask
+
+
+@pytest.mark.parametrize("name", names("inpaint", "textured body"))
+def test_inpaint(name: str, load: Load) -> None:
+    role = textured_body().inpaint if name == "textured body" else load("inpaint", name)
+    image = frames(1)[0]
+    filled = role(image, hole(), "a person", 3)
+    assert filled.shape == image.shape and filled.dtype == torch.float32
+    assert float(filled.min()) >= 0 and float(filled.max()) <= 1
+    outside = (hole() == 0).expand_as(image)
+    assert torch.equal(filled[outside], image[outside]) and not torch.equal(filled, image)
+    assert torch.equal(filled, role(image, hole(), "a person", 3))
+    if name != "textured body":
+        assert not torch.equal(filled, role(image, hole(), "a person", 4)), "the seed matters"
+    assert torch.equal(role(image, torch.zeros(1, H, W)), image), "nothing to fill: nothing changes"
+    with pytest.raises(ValueError, match="expected image"):
+        role(image, torch.zeros(1, H, W + 8))
+
+
+@pytest.mark.parametrize("name", names("views", "textured body"))
+def test_views(name: str, load: Load) -> None:
+    role = textured_body().views if name == "textured body" else load("views", name)
+    image = frames(1)[0]
+    views, azimuths = role(image, hole())
+    assert views.shape == (4, 3, H, W) and views.dtype == torch.float32
+    assert sorted(azimuths) == [0.0, 90.0, 180.0, 270.0]
+    assert float(views.min()) >= 0 and float(views.max()) <= 1
+    assert torch.equal(views, role(image, hole())[0])
+
+
+@pytest.mark.parametrize("name", names("face"))
+def test_face(name: str, load: Load) -> None:
+    role = load("face", name)
+    for count in (0, 1, 3):
+        eyes = orbit_eyes(torch.zeros(3), 1.0, torch.linspace(-0.5, 0.5, count))
+        cameras = Cameras(look_at(eyes, torch.zeros(3)), perspective_K(0.3, 40, 40).expand(count, 3, 3), 40, 40)
+        made = role(frames(2)[:, :, :56], torch.zeros(count, 52), cameras, 7)
+        assert made.shape == (count, 3, 40, 40) and made.dtype == torch.float32
+        assert count == 0 or (float(made.min()) >= 0 and float(made.max()) <= 1)
+    assert torch.equal(made, role(frames(2)[:, :, :56], torch.zeros(3, 52), cameras, 7))
+    assert not torch.equal(made, role(frames(2)[:, :, :56], torch.zeros(3, 52), cameras, 8)), "the seed matters"
+    with pytest.raises(ValueError, match="at least one reference"):
+        role(frames(0), torch.zeros(3, 52), cameras)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("name", names("video"))
+def test_video(name: str, load: Load) -> None:
+    role = load("video", name)
+    for count in (1, 5):
+        clip = torch.rand(2, 3, count, 32, 32, generator=torch.Generator().manual_seed(2))
+        latents = role.encode(clip)
+        text = role.embed(["a <v> person", ""])
+        velocity = role.velocity(latents, torch.tensor([0.95, 0.3]), Context(text))
+        decoded = role.decode(latents)
+        assert latents.shape[0] == 2 and latents.shape[2] == 1 + (count - 1) // 4
+        assert velocity.shape == latents.shape and decoded.shape == clip.shape
+        for value in (latents, velocity, decoded, text):
+            assert value.dtype == torch.float32 and value.device.type == "cpu" and bool(torch.isfinite(value).all())
+        assert float(decoded.min()) >= 0 and float(decoded.max()) <= 1
+    assert torch.equal(velocity, role.velocity(latents, torch.tensor([0.95, 0.3]), Context(text)))
+    one = role.velocity(latents[:1], 0.95, Context(text[:1]))
+    torch.testing.assert_close(one, velocity[:1], rtol=1e-4, atol=1e-5)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("name", names("perceptual", "ST-LPIPS"))
+def test_perceptual(name: str, load: Load) -> None:
+    role = StLpips() if name == "ST-LPIPS" else load("perceptual", name)
+    a, b = frames(3), frames(3).flip(0)
+    distance = role(a, b)
+    assert role.name and distance.shape == (3,) and distance.dtype == torch.float32
+    assert bool((distance >= 0).all()) and float(distance[0]) > 0 and not bool(role(a, a).any())
+    assert torch.equal(distance, role(a, b)) and role(a[:0], b[:0]).shape == (0,)
+    torch.testing.assert_close(role(a[:1], b[:1]), distance[:1], rtol=1e-5, atol=1e-6)
+    with pytest.raises(ValueError, match="of one size"):
+        role(a, b[:, :, :40])
