@@ -26,6 +26,8 @@ MIN_AREA = 64
 """Pixels of head; below, there is nothing of a face to learn."""
 FACING = 0.2
 """Cosine between where the face looks and where the camera is; below, it is a profile from behind."""
+SHARE = 0.15
+"""Of the head's weight. At the whole of it the sides of a head that the frames show from one side alone fall apart."""
 _MARGIN = 3
 
 
@@ -74,7 +76,8 @@ def observed_faces(
     numbers = [c.number for c in found]
     actions = torch.zeros(len(found), inputs.body.n_expressions) if expression is None else expression[numbers].float()
     relative = torch.stack([c.relative for c in found])
-    return FaceViews(torch.stack(images), torch.stack(alphas), torch.stack(weights), cameras, relative, actions), ""
+    pictures = torch.stack(images), torch.stack(alphas), torch.stack(weights)
+    return FaceViews(*pictures, cameras, relative, actions, SHARE), ""
 
 
 def _candidate(inputs: CoarseInputs, template: Template, kinematics: Kinematics, number: int) -> _Candidate | None:

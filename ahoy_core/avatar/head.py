@@ -33,6 +33,7 @@ class FaceViews:
         cameras: P cameras.
         relative: [P,J,4,4] canonical -> the cameras' space; identities for cameras in the canonical head frame.
         expression: [P,E] face actions.
+        share: Of the head's weight that they get: less than 1 where they count a second time what another loss counts.
     """
 
     images: Tensor
@@ -41,6 +42,7 @@ class FaceViews:
     cameras: Cameras
     relative: Tensor
     expression: Tensor
+    share: float = 1.0
 
     def __post_init__(self) -> None:
         count, size = len(self.images), self.images.shape[2:]

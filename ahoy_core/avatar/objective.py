@@ -90,7 +90,7 @@ class Objective:
         return Terms(
             weights.body * body,
             weights.observed * observed,
-            weights.head * self._head(chosen, generator),
+            weights.head * (self.faces.share if self.faces else 0.0) * self._head(chosen, generator),
             weights.perceptual * self._perceptual(pictures, generator),
             regularisers(chosen, self.template, self.around, weights) + weights.pose_change * change,
             corrections.prior(rows, weights) if moving else change.new_zeros(()),
