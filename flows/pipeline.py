@@ -75,7 +75,9 @@ def process(
 def _inputs(stage: Stage, source: Source, refs: Mapping[str, StageRef]) -> dict[str, StageRef | Source]:
     """What the stage needs, and of what it wants that which was made."""
     inputs: dict[str, StageRef | Source] = {"source": source} if "source" in stage.needs else {}
-    return inputs | {title: ref for title, ref in refs.items() if ref.stage in (*stage.needs, *stage.wants)}
+    # By title: whoever runs the stages may hand on another artifact in a stage's place.
+    asked = (*stage.needs, *stage.wants)
+    return inputs | {title: ref for title, ref in refs.items() if title.partition("/")[0] in asked}
 
 
 def _summaries(stage: Stage, inputs: Mapping[str, StageRef | Source], run: Run) -> dict[str, Mapping[str, Any]]:

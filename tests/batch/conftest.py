@@ -29,7 +29,14 @@ from flows.serve.install import ENTRYPOINTS, FEED_BATCH, PROCESS_VIDEO, Installa
 from flows.serve.place import QUIET, WORKER_SETTINGS, Place, client_environment, connected
 
 ROOT = Path(__file__).resolve().parents[2]
+LIMIT_S = 900  # of a test: several processes start in it one after another, and the machine may be busy
 READY_S = 240.0  # far more than anything takes; a test that waits so long has failed
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if Path(__file__).parent in item.path.parents:
+            item.add_marker(pytest.mark.timeout(LIMIT_S))
 
 
 def wait_for(condition: Callable[[], Any], what: str, limit_s: float = READY_S) -> Any:

@@ -169,7 +169,7 @@ def test_the_perceptual_net_is_named_in_row_and_id(
         def __call__(self, a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
             return (a - b).abs().flatten(1).mean(1)
 
-    monkeypatch.setattr(cell_module, "perceptual_network", Net)
+    monkeypatch.setattr(cell_module, "perceptual_network", lambda fills: Net())
     monkeypatch.setattr("ahoy_core.metrics.score.MIN_SIDE", 8)  # the person is 20 pixels wide here
     found = _rows(*made, reference("reference: flat colour"), tmp_path, protocols=("novel-view-gt",))
     by_region: Mapping[str, dict] = {row["region"]: row for row in found}

@@ -49,8 +49,8 @@ def command(folder: Path, name: str, body: str, *more: str) -> tuple[str, ...]:
 
 
 def synchuman(folder: Path) -> Fill:
-    return Fill(fill="synchuman", command=command(folder, "synchuman", SYNCHUMAN), timeout_s=60)
+    return Fill(fill="synchuman", command=command(folder, "synchuman", SYNCHUMAN), timeout_s=250)
 
 
 def cap4d(folder: Path) -> Fill:
-    return Fill(fill="cap4d", command=command(folder, "cap4d", CAP4D, "{seed}"), timeout_s=60)
+    return Fill(fill="cap4d", command=command(folder, "cap4d", CAP4D, "{seed}"), timeout_s=250)

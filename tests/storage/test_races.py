@@ -161,7 +161,7 @@ def test_an_expired_lease_is_taken_over_by_exactly_one(store: ArtifactStore) -> 
 
 
 def test_a_worker_can_wait_for_a_lease(store: ArtifactStore) -> None:
-    abandoned(store, 0.2)
+    abandoned(store, 2.0)
     with store.lease(KEY, "impatient", 60) as held:
         assert not held
     with store.lease(KEY, "patient", 60, wait_s=30) as held:

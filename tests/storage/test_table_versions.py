@@ -57,12 +57,12 @@ def test_stages_of_version_1_get_an_order_and_keep_everything_else(store: Artifa
     assert second["stage"] == "perceive"
 
 
-def test_metrics_of_version_1_say_nothing_of_roles_and_keep_everything_else(store: ArtifactStore) -> None:
+def test_metrics_of_version_1_were_made_from_the_video_and_say_nothing_of_roles(store: ArtifactStore) -> None:
     now = TABLES["metrics"]
-    columns = pa.schema([column for column in now.columns if column.name != "roles"])
+    columns = pa.schema([column for column in now.columns if column.name not in ("roles", "input_setting")])
     Tables(store, {"metrics": TableSchema("metrics", 1, columns)}).append("metrics", [REQUIRED["metrics"]], batch="b")
     assert Tables(store).read("metrics", "b").to_pylist() == [
-        {"batch": "b", **dict.fromkeys(now.columns.names), **REQUIRED["metrics"]}
+        {"batch": "b", **dict.fromkeys(now.columns.names), **REQUIRED["metrics"], "input_setting": "video"}
     ]
 
 
