@@ -8,9 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from pydantic import ValidationError
 from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
 
 from flows import (
@@ -25,6 +23,7 @@ from flows import (
     store_cli,
     view_cli,
 )
+from flows.bad_input import bad_input_said
 from storage_schema.secrets import RedactSecrets
 
 if TYPE_CHECKING:
@@ -42,7 +41,6 @@ COMMANDS = (
 for command in COMMANDS:
     app.command()(command)
 
-EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
 
 
@@ -93,38 +91,28 @@ def run(
 
     console = Console()
     try:
-        models_cli.choose_roles(roles, role or [], trust_code)
-        request = VideoRequest.model_validate(
-            {
-                "video": video,
-                "out": str(out),
-                "store": store,
-                "preset": preset,
-                "subject": int(subject) if subject and subject.isdigit() else subject,
-                "stages": tuple(stages.split(",")) if stages else None,
-                "overrides": tuple(set_ or ()),
-            }
-        )
-        if list_subjects:
-            paths = _list_here(request, console)
-        else:
-            paths = _run_flow(request) if prefect else _run_here(request, console)
+        with bad_input_said(console):
+            models_cli.choose_roles(roles, role or [], trust_code)
+            request = VideoRequest.model_validate(
+                {
+                    "video": video,
+                    "out": str(out),
+                    "store": store,
+                    "preset": preset,
+                    "subject": int(subject) if subject and subject.isdigit() else subject,
+                    "stages": tuple(stages.split(",")) if stages else None,
+                    "overrides": tuple(set_ or ()),
+                }
+            )
+            if list_subjects:
+                paths = _list_here(request, console)
+            else:
+                paths = _run_flow(request) if prefect else _run_here(request, console)
     except KeyboardInterrupt:
         console.print("interrupted; finished stages are kept, the same command goes on from there")
         raise typer.Exit(EXIT_INTERRUPTED) from None
-    except ValidationError as error:
-        for problem in error.errors():
-            _complain(console, f"--{'.'.join(map(str, problem['loc']))}: {problem['msg']}, got {problem['input']!r}")
-        raise typer.Exit(EXIT_BAD_INPUT) from None
-    except (ValueError, OSError) as error:
-        _complain(console, str(error))
-        raise typer.Exit(EXIT_BAD_INPUT) from None
     for name, path in paths.items():
         console.print(f"{name:<20} {path}", soft_wrap=True, highlight=False)
-
-
-def _complain(console: Console, message: str) -> None:
-    console.print("[red]error:[/]", escape(message), highlight=False, soft_wrap=True)
 
 
 def _run_here(request: VideoRequest, console: Console) -> dict[str, Path]:

@@ -6,11 +6,12 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from pydantic import ValidationError
 from rich.console import Console
 from rich.markup import escape
 
-EXIT_BAD_INPUT, EXIT_SOME_FAILED = 2, 1
+from flows.bad_input import bad_input_said
+
+EXIT_SOME_FAILED = 1
 
 
 def evaluate(
@@ -62,7 +63,7 @@ def evaluate(
         "beside": tuple(beside or ()),
         **({"protocols": _names(protocols)} if protocols else {}),
     }
-    try:
+    with bad_input_said(console):
         request = EvaluateRequest.model_validate(fields)
         if prefect:
             paths = {name: Path(path) for name, path in evaluate_flow(request).items()}
@@ -75,13 +76,6 @@ def evaluate(
             for line in remarks(cells):
                 console.print(escape(line), highlight=False, soft_wrap=True)
             failed = any(cell.error for cell in cells)
-    except ValidationError as error:
-        for problem in error.errors():
-            _complain(console, f"--{'.'.join(map(str, problem['loc']))}: {problem['msg']}, got {problem['input']!r}")
-        raise typer.Exit(EXIT_BAD_INPUT) from None
-    except (ValueError, OSError) as error:
-        _complain(console, str(error))
-        raise typer.Exit(EXIT_BAD_INPUT) from None
     for name, path in paths.items():
         console.print(f"{name:<20} {path}", soft_wrap=True, highlight=False)
     if failed:
@@ -90,7 +84,3 @@ def evaluate(
 
 def _names(text: str | None) -> tuple[str, ...]:
     return tuple(name.strip() for name in text.split(",") if name.strip()) if text else ()
-
-
-def _complain(console: Console, message: str) -> None:
-    console.print("[red]error:[/]", escape(message), highlight=False, soft_wrap=True)

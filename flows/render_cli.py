@@ -9,13 +9,12 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from pydantic import ValidationError
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-EXIT_BAD_INPUT = 2
+from flows.bad_input import bad_input_said
 
 
 def render(
@@ -53,7 +52,7 @@ def render(
     from tasks.render import RenderRequest, prepare, render_clip
 
     console = Console()
-    try:
+    with bad_input_said(console, MemoryError):
         width, height = _size(size)
         request = RenderRequest.model_validate(
             {
@@ -84,21 +83,10 @@ def render(
             return
         with _bar(console) as show:
             record = render_clip(job, out, workers=workers, progress=show, keep_frames=keep_frames)
-    except ValidationError as error:
-        for problem in error.errors():
-            _complain(console, f"--{'.'.join(map(str, problem['loc']))}: {problem['msg']}, got {problem['input']!r}")
-        raise typer.Exit(EXIT_BAD_INPUT) from None
-    except (ValueError, OSError, MemoryError) as error:
-        _complain(console, str(error))
-        raise typer.Exit(EXIT_BAD_INPUT) from None
     _show_costs(console, record)
     if request.pca:
         _plot_pull(record, out)
     console.print(f"{'video' if out.suffix == '.mp4' else 'frames':<8} {out}", soft_wrap=True, highlight=False)
-
-
-def _complain(console: Console, message: str) -> None:
-    console.print("[red]error:[/]", escape(message), highlight=False, soft_wrap=True)
 
 
 def _size(text: str) -> tuple[int, int]:

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import max_pool2d, relu
 
-from ahoy_core.metrics.stlpips import MIN_SIDE, SCALE, SHIFT, check_pictures, normalised
+from ahoy_core.metrics.stlpips import MIN_SIDE, SCALE, SHIFT, check_pictures, weighted_difference
 from ahoy_core.models.adapter import Adapter, Fill
 from ahoy_core.models.checkpoint import device_of, read_state, take
 
@@ -102,11 +102,7 @@ class Lpips(nn.Module):
             ValueError: If the shapes differ or a side is too short.
         """
         check_pictures(a, b, MIN_SIDE)
-        total = a.new_zeros(len(a))
-        for first, second, head in zip(self.features(a), self.features(b), self.heads, strict=True):
-            difference = (normalised(first) - normalised(second)).square()
-            total = total + (difference * head.to(a)).sum(1).mean((1, 2))
-        return total
+        return weighted_difference(self.features(a), self.features(b), self.heads)
 
     def features(self, image: Tensor) -> list[Tensor]:
         """Activations after each stage for [B,3,H,W] in [0,1]."""

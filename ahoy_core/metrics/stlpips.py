@@ -7,6 +7,7 @@ with learned channel weights, on an AlexNet whose strides are blur-pools); the t
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import torch
@@ -51,11 +52,7 @@ class StLpips(nn.Module):
             ValueError: If the shapes differ or a side is too short.
         """
         check_pictures(a, b, MIN_SIDE)
-        total = a.new_zeros(len(a))
-        for first, second, head in zip(self.features(a), self.features(b), self.heads, strict=True):
-            difference = (normalised(first) - normalised(second)).square()
-            total = total + (difference * head.to(a)).sum(1).mean((1, 2))
-        return total
+        return weighted_difference(self.features(a), self.features(b), self.heads)
 
     def features(self, image: Tensor) -> list[Tensor]:
         """Activations of the five convolutions for [B,3,H,W] in [0,1]."""
@@ -89,6 +86,21 @@ def normalised(features: Tensor) -> Tensor:
     """Features [B,C,h,w] of length 1 in every pixel (0 where there are none)."""
     # The square root has no gradient at 0, where all features of a flat patch may lie.
     return features / ((features.square().sum(1, keepdim=True) + 1e-12).sqrt() + 1e-10)
+
+
+def weighted_difference(first: Sequence[Tensor], second: Sequence[Tensor], heads: Iterable[Tensor]) -> Tensor:
+    """LPIPS's distance [B] of two pictures' features, layer by layer with learned channel weights (its equation 1).
+
+    Args:
+        first: [B,C,h,w] of each layer.
+        second: Likewise.
+        heads: [1,C,1,1] of each layer.
+    """
+    total = first[0].new_zeros(len(first[0]))
+    for one, other, head in zip(first, second, heads, strict=True):
+        difference = (normalised(one) - normalised(other)).square()
+        total = total + (difference * head.to(one)).sum(1).mean((1, 2))
+    return total
 
 
 def _blur_pool(x: Tensor) -> Tensor:

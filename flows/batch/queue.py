@@ -86,7 +86,7 @@ class Queue:
         while True:
             page = await self.client.read_flow_runs(
                 flow_filter=FlowFilter(name=FlowFilterName(any_=[flow])),
-                flow_run_filter=self._filter(live),
+                flow_run_filter=self._filter(_LIVE if live else None),
                 sort=FlowRunSort.ID_DESC,
                 limit=PAGE,
                 offset=offset,
@@ -112,16 +112,14 @@ class Queue:
     async def count_live(self) -> int:
         """How many runs of videos have not ended, whoever created them."""
         return await self.client.count_flow_runs(
-            flow_filter=FlowFilter(name=FlowFilterName(any_=[PROCESS_VIDEO])), flow_run_filter=self._filter(True)
+            flow_filter=FlowFilter(name=FlowFilterName(any_=[PROCESS_VIDEO])), flow_run_filter=self._filter(_LIVE)
         )
 
     async def count_crashed_feeders(self, since: datetime) -> int:
         """How many feeders of the batch that began after a time have crashed."""
-        crashed = FlowRunFilterState(type=FlowRunFilterStateType(any_=[StateType.CRASHED]))
-        began = FlowRunFilterStartTime(after_=since)
+        crashed = self._filter([StateType.CRASHED], FlowRunFilterStartTime(after_=since))
         return await self.client.count_flow_runs(
-            flow_filter=FlowFilter(name=FlowFilterName(any_=[FEED_BATCH])),
-            flow_run_filter=FlowRunFilter(tags=FlowRunFilterTags(all_=self.tags), state=crashed, start_time=began),
+            flow_filter=FlowFilter(name=FlowFilterName(any_=[FEED_BATCH])), flow_run_filter=crashed
         )
 
     async def create(self, work: Sequence[Work], parameters: Sequence[dict[str, Any]]) -> list[str]:
@@ -191,9 +189,12 @@ class Queue:
 
         await asyncio.gather(*map(one, runs))
 
-    def _filter(self, live: bool) -> FlowRunFilter:
-        state = FlowRunFilterState(type=FlowRunFilterStateType(any_=_LIVE)) if live else None
-        return FlowRunFilter(tags=FlowRunFilterTags(all_=self.tags), state=state)
+    def _filter(
+        self, states: list[StateType] | None, start_time: FlowRunFilterStartTime | None = None
+    ) -> FlowRunFilter:
+        """The batch's runs in these states (None: in any) that began so."""
+        state = FlowRunFilterState(type=FlowRunFilterStateType(any_=states)) if states else None
+        return FlowRunFilter(tags=FlowRunFilterTags(all_=self.tags), state=state, start_time=start_time)
 
 
 def seen_run(run: FlowRun) -> SeenRun | None:
