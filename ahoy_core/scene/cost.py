@@ -12,17 +12,15 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from ahoy_core.conventions import Cameras, look_at, perspective_K
-from ahoy_core.splat import rasterization
-from ahoy_core.splat.constants import ALPHA_CUTOFF
+from ahoy_core.splat import Window, footprints, rasterization
 
 _TILE = 16
-_NEAR = 0.05
 
 
 class RasterLoad(NamedTuple):
@@ -55,22 +53,28 @@ class Rates:
         carry: Per surface point whose normal is carried along.
         pair: Per pair of occluder and receiver of a contact shadow.
         shade: Per Gaussian whose colour is changed.
+        pick: Per Gaussian of a scene that is looked through for those in a window.
+        paste: Per pixel of a picture into which a window is drawn.
+        curve: Per Gaussian of an avatar that is put between two poses.
         blend: Per pixel that is summed into a picture of several samples.
         write: Per pixel of a picture that is stored.
         face: Per avatar with an expression, once: what each action does; a frame then takes under a millisecond.
     """
 
-    gaussian: float = 1.0e-7
-    visible: float = 2e-8
-    intersection: float = 1.6e-7
-    pixel: float = 3.5e-8
-    skin: float = 0.004
-    joints: float = 0.004
-    pose: float = 5.5e-7
-    carry: float = 4.0e-7
-    pair: float = 2.8e-8
-    shade: float = 3.6e-7
-    blend: float = 5.0e-8
+    gaussian: float = 7.1e-8
+    visible: float = 0.0
+    intersection: float = 1.7e-7
+    pixel: float = 1.8e-8
+    skin: float = 0.0035
+    joints: float = 0.0025
+    pose: float = 3.7e-7
+    carry: float = 2.4e-7
+    pair: float = 6.5e-9
+    shade: float = 1.9e-7
+    pick: float = 2.4e-8
+    paste: float = 1.5e-9
+    curve: float = 6.5e-9
+    blend: float = 3.5e-8
     write: float = 6.5e-8
     face: float = 0.29
 
@@ -88,39 +92,32 @@ class Rates:
         )
 
 
-def raster_load(means: Tensor, covars: Tensor, opacities: Tensor, cameras: Cameras) -> RasterLoad:
-    """The load of rendering N Gaussians through the first of `cameras`, from bounding circles.
+def raster_load(
+    means: Tensor, covars: Tensor, opacities: Tensor, cameras: Cameras, window: Window | None = None
+) -> RasterLoad:
+    """The load of rendering N Gaussians through the first of `cameras`, or a part of its picture.
 
     Args:
         means: [N,3] world.
         covars: [N,3,3].
         opacities: [N].
         cameras: The first one counts.
+        window: The part of the picture; Gaussians that do not reach into it are not in the load.
     """
-    width, height = cameras.width, cameras.height
-    u, v, radius, depth = footprints(means, covars, opacities, cameras)
-    seen = (depth > _NEAR) & (u + radius > 0) & (u - radius < width) & (v + radius > 0) & (v - radius < height)
-    across, down = (_tiles(c[seen], radius[seen], side) for c, side in ((u, width), (v, height)))
-    return RasterLoad(float(len(means)), float(seen.sum()), float((across * down).sum()), float(width * height))
+    view, K = cameras.viewmats[:1].contiguous(), cameras.Ks[:1].contiguous()
+    box = footprints(means, covars, opacities, view, K, cameras.width, cameras.height)[0]
+    return box_load(box, len(means), window or (0, 0, cameras.width, cameras.height), window is not None)
 
 
-def _tiles(center: Tensor, radius: Tensor, side: int) -> Tensor:
-    first, last = ((center + sign * radius).clamp(0, side - 1).div(_TILE).floor() for sign in (-1, 1))
-    return last - first + 1
-
-
-def footprints(
-    means: Tensor, covars: Tensor, opacities: Tensor, cameras: Cameras
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Where Gaussians are in the picture of the first camera: u, v, radius [N] in pixels and depth [N] in metres."""
-    viewmat, K = cameras.viewmats[0].to(means), cameras.Ks[0].to(means)
-    camera = means @ viewmat[:3, :3].T + viewmat[:3, 3]
-    depth = camera[:, 2]
-    near = depth.clamp(min=_NEAR)
-    u, v = (K[i, i] * camera[:, i] / near + K[i, 2] for i in (0, 1))
-    sigmas = (2 * torch.log((opacities / ALPHA_CUTOFF).clamp(min=1))).sqrt()
-    extent = (covars.diagonal(dim1=1, dim2=2).sum(1).clamp(min=0) / 2).sqrt() * K[0, 0] / near
-    return u, v, sigmas * (extent + 0.5), depth
+def box_load(box: Tensor, count: int, window: Window, picked: bool) -> RasterLoad:
+    """The load of drawing a window over `count` Gaussians with footprints [N,4], or only those in it (`picked`)."""
+    left, top, width, height = window
+    low = torch.maximum(box[:, :2] - box.new_tensor([left, top]), box.new_zeros(2))
+    high = torch.minimum(box[:, 2:] - box.new_tensor([left, top]), box.new_tensor([width, height]))
+    seen = (high > low).all(1)
+    tiles = ((high[seen] - 1).div(_TILE).floor() - low[seen].div(_TILE).floor() + 1).prod(1)
+    visible = float(seen.sum())
+    return RasterLoad(visible if picked else float(count), visible, float(tiles.sum()), float(width * height))
 
 
 def calibrate(seconds: float = 0.4) -> Rates:
@@ -148,10 +145,10 @@ def calibrate(seconds: float = 0.4) -> Rates:
 
 
 def rasterize(
-    means: Tensor, covars: Tensor, opacities: Tensor, colors: Tensor, cameras: Cameras
-) -> tuple[Tensor, Tensor, Tensor]:
-    """One rasterization on one thread: premultiplied colours [C,H,W,D], alphas [C,H,W,1], radii [C,N,2]."""
-    image, alpha, meta = rasterization(
+    means: Tensor, covars: Tensor, opacities: Tensor, colors: Tensor, cameras: Cameras, window: Window | None = None
+) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    """One rasterization on one thread: premultiplied colours [C,H,W,D], alphas [C,H,W,1], and the rasterizer's meta."""
+    return rasterization(
         means,
         None,
         None,
@@ -164,8 +161,8 @@ def rasterize(
         camera_model=cameras.camera_model,
         covars=covars,
         num_threads=1,
+        window=window,
     )
-    return image, alpha, meta["radii"]
 
 
 @dataclass

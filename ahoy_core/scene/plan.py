@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
-from ahoy_core.scene.cost import RasterLoad, Rates
-from ahoy_core.scene.effects.contact_shadow import CONTACT_SHADOW
+from ahoy_core.scene.cost import Rates
+from ahoy_core.scene.effects.contact_shadow import CONTACT_SHADOW, redraw_seconds
 from ahoy_core.scene.effects.effect import Effect, Verdict
 from ahoy_core.scene.effects.expression import EXPRESSION
 from ahoy_core.scene.effects.foot_contact import FOOT_CONTACT
 from ahoy_core.scene.effects.light import LIGHT
-from ahoy_core.scene.effects.occlusion import OCCLUSION
+from ahoy_core.scene.effects.occlusion import OCCLUSION, joint_seconds
 from ahoy_core.scene.effects.sampling import DEPTH_OF_FIELD, MOTION_BLUR, posing
 from ahoy_core.scene.effects.view_color import VIEW_COLOR
+from ahoy_core.scene.exposure import KNOTS
 from ahoy_core.scene.puppet import Puppet
 from ahoy_core.scene.scene import Scene
 from ahoy_core.scene.shot import Content, Shot
@@ -151,38 +152,41 @@ def base_seconds(content: Content, rates: Rates, joint: bool = False) -> float:
         joint: Avatars and scene are drawn together, which is the work of an effect.
     """
     each = posing(content, rates) + content.pixels * rates.write
-    each += 0.0 if joint else rates.raster(content.avatar_load)
+    each += 0.0 if joint else over_seconds(content, rates)
     views = 1 if content.shot.still else 0 if joint else content.frames
     drawn = rates.raster(content.scene_load) if len(content.scene) else 0.0
     return content.frames * each + views * drawn
 
 
-def _with_shared_work(plan: Plan, content: Content, rates: Rates) -> Plan:
-    """Estimates corrected for work that two effects share, so that the plan's sum is the clip's cost.
+def over_seconds(content: Content, rates: Rates) -> float:
+    """CPU-seconds of drawing the avatars over a picture that is there."""
+    window = content.avatar_window
+    area = 0.0 if window is None else float(window[2] * window[3])
+    return rates.raster(content.avatar_load._replace(pixels=area)) + content.pixels * rates.paste
 
-    Samples of blur and focus are the same samples; each of them redoes what is done once a frame; and a scene whose
-    shadows change has to be drawn again in every frame, which the joint picture does anyway.
+
+def _with_shared_work(plan: Plan, content: Content, rates: Rates) -> Plan:
+    """Estimates of blur and focus with what the other effects make of each of their samples.
+
+    Samples of blur and focus are the same samples. Avatars are posed three times an exposure at most, light and shadow
+    are those of its middle; but every place of the lens has a view of its own.
     """
     effects = {effect.name: effect for effect in plan.effects}
-    if plan.on("motion_blur") and plan.on("depth_of_field"):
-        less = min(("motion_blur", "depth_of_field"), key=lambda name: effects[name].quality)
-        effects[less] = _costing(effects[less], 0.0)
-    redraw = RasterLoad(0, 0, 0, 0) if plan.on("occlusion") else content.scene_load
-    if plan.on("contact_shadow") and not plan.on("occlusion"):
-        shadow = effects["contact_shadow"]
-        effects["contact_shadow"] = _costing(shadow, shadow.seconds + content.frames * rates.raster(redraw))
-    per_sample = sum(effects[n].seconds for n in ("contact_shadow", "light", "expression") if effects[n].on)
-    for name in ("motion_blur", "depth_of_field"):
-        effect = effects[name]
-        if effect.on and effect.seconds > 0 and effect.quality > 1:
-            extra = (effect.quality - 1) * per_sample
-            if not plan.on("occlusion"):
-                joint = rates.raster(content.avatar_load.plus(content.scene_load)) - rates.raster(content.avatar_load)
-                drawn = content.scene_load if not content.shot.still else RasterLoad(0, 0, 0, 0)
-                extra -= content.frames * (effect.quality - 1) * (joint - rates.raster(drawn))
-            effects[name] = _costing(effect, max(0.0, effect.seconds + extra))
-    return Plan(tuple(effects.values()), plan.base_seconds, plan.frames, plan.strengths)
-
-
-def _costing(effect: Planned, seconds: float) -> Planned:
-    return Planned(effect.name, effect.on, effect.reason, seconds, effect.evidence, effect.quality)
+    names = [name for name in ("motion_blur", "depth_of_field") if plan.on(name)]
+    if not names:
+        return plan
+    most = max(names, key=lambda name: effects[name].quality)
+    more = plan.samples - 1
+    each = joint_seconds(content, rates) if plan.on("occlusion") else over_seconds(content, rates)
+    once = 0.0
+    if plan.on("motion_blur"):
+        each += min(KNOTS - 1, more) * posing(content, rates) / max(1, more)
+    if not content.shot.still:
+        each += 0.0 if plan.on("occlusion") else rates.raster(content.scene_load)
+    elif plan.on("depth_of_field"):
+        once = more * rates.raster(content.scene_load)
+        each += redraw_seconds(content, rates) if plan.on("contact_shadow") else 0.0
+    total = effects[most].seconds + content.frames * more * each + once
+    for name in names:
+        effects[name] = replace(effects[name], seconds=total if name == most else 0.0)
+    return replace(plan, effects=tuple(effects.values()))

@@ -7,7 +7,6 @@ section of the ledger, so an effect that is off has no entry, makes no tensor an
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -16,13 +15,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ahoy_core.avatar.avatar import Posed
-from ahoy_core.body.rotations import axis_angle_to_matrix, matrix_to_axis_angle
 from ahoy_core.conventions import Cameras
 from ahoy_core.formats.images import to_uint8
-from ahoy_core.motion.time import slerp
+from ahoy_core.scene.backdrop import Backdrop, look, shaded, together, undrawn, with_avatars
 from ahoy_core.scene.color import to_linear, to_srgb
-from ahoy_core.scene.cost import Ledger, rasterize
+from ahoy_core.scene.cost import Ledger
 from ahoy_core.scene.effects import contact_shadow, foot_contact, light, sampling, view_color
+from ahoy_core.scene.exposure import Exposure, at_moment, knots
 from ahoy_core.scene.plan import BASE, Plan
 from ahoy_core.scene.puppet import Points, Puppet
 from ahoy_core.scene.scene import Scene
@@ -32,17 +31,11 @@ Picture = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
-class SceneView:
-    """A scene before one camera: rows of the Gaussians that can be seen, their colours, and its picture alone."""
+class _Scenery:
+    """What all samples of one frame share: shadow on the scene, and backdrops that were shaded already."""
 
-    rows: Tensor
-    means: Tensor
-    covars: Tensor
-    opacities: Tensor
-    colors: Tensor
-    image: Tensor
-    alpha: Tensor
-    receivers: contact_shadow.Receivers | None = None
+    shadow: contact_shadow.Shadow | None
+    backdrops: dict[tuple[float, float], Backdrop] = field(default_factory=dict)
 
 
 @dataclass
@@ -56,7 +49,7 @@ class Stage:
     ledger: Ledger = field(default_factory=Ledger)
 
     def __post_init__(self) -> None:
-        self._views: dict[tuple[float, float], SceneView] = {}
+        self._views: dict[tuple[float, float], Backdrop] = {}
         self._lock = threading.Lock()
         if self.plan.on("foot_contact"):
             with self.ledger.section("foot_contact"):
@@ -71,6 +64,7 @@ class Stage:
         if self.plan.on("contact_shadow"):
             with self.ledger.section("contact_shadow"):
                 self._discs = [contact_shadow.occluders(puppet) for puppet in self.puppets]
+                self._axes = contact_shadow.short_axes(self.scene.gaussians)
         self._focus = sampling.focus_of(content) if self.plan.on("depth_of_field") else 1.0
         moving, lens = self.plan.on("motion_blur"), self.plan.on("depth_of_field")
         count = self.plan.samples
@@ -81,146 +75,112 @@ class Stage:
     @torch.no_grad()
     def picture(self, frame: int) -> Picture:
         """uint8 [H,W,3] of a frame."""
-        if len(self._samples) == 1:
-            return to_uint8(self._sample(frame, self._samples[0], None).permute(2, 0, 1))
-        total = self._sample(frame, self._samples[0], None)
-        # The first sample is what the frame costs anyway; the others are the price of blur.
-        blur = ("motion_blur", "depth_of_field")
-        name = max((n for n in blur if self.plan.on(n)), key=lambda n: self.plan[n].quality)
-        with self.ledger.section(name):
-            total = to_linear(total)
-            for sample in self._samples[1:]:
-                total += to_linear(self._sample(frame, sample, name))
-            total = to_srgb(total / len(self._samples))
+        exposure, scenery = self._exposed(frame)
+        total = self._sample(frame, self._samples[0], exposure, scenery, self.ledger)
+        if len(self._samples) > 1:
+            # The first sample is what the frame costs anyway; the others are the price of blur.
+            with self.ledger.section(self._blur):
+                total = to_linear(total)
+                for sample in self._samples[1:]:
+                    total += to_linear(self._sample(frame, sample, exposure, scenery, Ledger()))
+                total = to_srgb(total / len(self._samples))
         return to_uint8(total.permute(2, 0, 1))
 
-    def _sample(self, frame: int, sample: sampling.Sample, inside: str | None) -> Tensor:
-        """One picture [H,W,3] sRGB; `inside` names the effect that asked for it, whose time its parts are then."""
-        ledger = self.ledger if inside is None else Ledger()
+    @property
+    def _blur(self) -> str:
+        """The effect that asked for most of the samples, whose time they are."""
+        return max(
+            (n for n in ("motion_blur", "depth_of_field") if self.plan.on(n)), key=lambda n: self.plan[n].quality
+        )
+
+    def _exposed(self, frame: int) -> tuple[Exposure, _Scenery]:
+        """A frame's avatars, posed and lit, and what they do to the scene; light and shadow are those of its middle."""
+        moments = knots([sample.moment for sample in self._samples])
+        middle = moments[len(moments) // 2]
+        lit, relative = self._lit(frame, middle, self._posed(frame, middle, self.ledger))
+        shadow = None
+        if self.plan.on("contact_shadow"):
+            with self.ledger.section("contact_shadow"):
+                eye, strength = self.shot.at(frame).centers[0], self.plan.strength("contact_shadow")
+                means = self.scene.gaussians.means
+                shadow = contact_shadow.cast(means, self._axes, eye, self._discs, relative, strength)
+        shown = together(lit)
+        posed = {middle: shown}
+        for moment in moments:
+            if moment != middle:
+                with self.ledger.section(self._blur):
+                    there = together(self._posed(frame, moment, Ledger()))
+                    posed[moment] = replace(there, colors=shown.colors)
+        return Exposure(moments, tuple(posed[moment] for moment in moments)), _Scenery(shadow)
+
+    def _posed(self, frame: int, moment: float, ledger: Ledger) -> list[Posed]:
+        """Each avatar a share of a frame after a frame, in its own colours."""
+        made = []
+        for puppet in self.puppets:
+            pose, transl = at_moment(puppet.motion, frame, moment)
+            face = None
+            if self.plan.on("expression") and puppet.motion.expression is not None:
+                with ledger.section("expression"):
+                    face = puppet.avatar.face_offset(puppet.body, puppet.motion.expression[frame])
+            with ledger.section(BASE):
+                made.append(puppet.avatar.pose(puppet.body, pose, transl, face=face))
+        return made
+
+    def _lit(self, frame: int, moment: float, posed: list[Posed]) -> tuple[list[Posed], list[Tensor]]:
+        """The same in the scene's light, and their joints' transforms, as far as an effect needs them."""
+        if not (self.plan.on("light") or self.plan.on("contact_shadow")):
+            return posed, []
+        lit, relative = [], []
+        for number, (puppet, one) in enumerate(zip(self.puppets, posed, strict=True)):
+            with self.ledger.section("light" if self.plan.on("light") else "contact_shadow"):
+                pose, transl = at_moment(puppet.motion, frame, moment)
+                relative.append(puppet.relative(pose[None], transl[None])[0])
+            if self.plan.on("light"):
+                with self.ledger.section("light"):
+                    _, normals = puppet.points.posed(relative[-1])
+                    strength = self.plan.strength("light")
+                    one = replace(one, colors=light.relight(one.colors, normals, self._lights[number], strength))
+            lit.append(one)
+        return lit, relative
+
+    def _sample(
+        self, frame: int, sample: sampling.Sample, exposure: Exposure, scenery: _Scenery, ledger: Ledger
+    ) -> Tensor:
+        """One picture [H,W,3] sRGB."""
         cameras = sampling.shot_at(self.shot, frame, sample.moment)
         if sample.offset != (0.0, 0.0):
             cameras = sampling.through_lens(cameras, sample.offset, self.shot.aperture, self._focus)
-        posed: list[Posed] = []
-        relative: list[Tensor] = []
-        for number, puppet in enumerate(self.puppets):
-            one, joints = self._posed(number, puppet, frame, sample.moment, ledger)
-            posed.append(one)
-            relative += [] if joints is None else [joints]
-        return self._composed(posed, relative, cameras, sample.offset, ledger)
+        backdrop = self._backdrop(cameras, sample.offset, scenery, ledger)
+        joint = self.plan.on("occlusion")
+        with ledger.section("occlusion" if joint else BASE):
+            return with_avatars(backdrop, exposure.at(sample.moment), joint)
 
-    def _posed(
-        self, number: int, puppet: Puppet, frame: int, moment: float, ledger: Ledger
-    ) -> tuple[Posed, Tensor | None]:
-        motion = puppet.motion
-        pose, transl = motion.pose[frame], motion.transl[frame]
-        if moment > 0 and len(motion) > 1:
-            pose, transl = _between(puppet, frame, moment)
-        face = None
-        if self.plan.on("expression") and motion.expression is not None:
-            with ledger.section("expression"):
-                face = puppet.avatar.face_offset(puppet.body, motion.expression[frame])
-        with ledger.section(BASE):
-            posed = puppet.avatar.pose(puppet.body, pose, transl, face=face)
-        relative = None
-        if self.plan.on("light") or self.plan.on("contact_shadow"):
-            with ledger.section("light" if self.plan.on("light") else "contact_shadow"):
-                relative = puppet.relative(pose[None], transl[None])[0]
-        if self.plan.on("light") and relative is not None:
-            with ledger.section("light"):
-                _, normals = puppet.points.posed(relative)
-                lit = light.relight(posed.colors, normals, self._lights[number], self.plan.strength("light"))
-                posed = replace(posed, colors=lit)
-        return posed, relative
-
-    def _composed(
-        self,
-        posed: Sequence[Posed],
-        relative: Sequence[Tensor],
-        cameras: Cameras,
-        offset: tuple[float, float],
-        ledger: Ledger,
-    ) -> Tensor:
-        avatars = _joined(posed)
-        if not len(self.scene):
-            return self._over(avatars, None, cameras, ledger)
-        view = self._view(cameras, offset, ledger)
-        if self.plan.on("contact_shadow"):
-            view = self._shaded(view, relative, cameras, ledger)
-        if not self.plan.on("occlusion"):
-            return self._over(avatars, view, cameras, ledger)
-        with ledger.section("occlusion"):
-            means, covars = torch.cat([avatars.means, view.means]), torch.cat([avatars.covars, view.covars])
-            opacities, colors = torch.cat([avatars.opacities, view.opacities]), torch.cat([avatars.colors, view.colors])
-            image, alpha, _ = rasterize(means, covars, opacities, colors, cameras)
-            return image[0] + self.shot.background * (1 - alpha[0])
-
-    def _shaded(self, view: SceneView, relative: Sequence[Tensor], cameras: Cameras, ledger: Ledger) -> SceneView:
-        """The scene with the avatars' shadows, drawn again if its picture is needed."""
-        with ledger.section("contact_shadow"):
-            to = view.receivers
-            if to is None:
-                to = contact_shadow.receivers(self.scene.gaussians, view.rows, cameras.centers[0])
-            strength = self.plan.strength("contact_shadow")
-            colors = contact_shadow.shade(view.colors, to, self._discs, list(relative), strength)
-            if colors is view.colors or self.plan.on("occlusion"):
-                return replace(view, colors=colors)
-            image, alpha, _ = rasterize(view.means, view.covars, view.opacities, colors, cameras)
-            return replace(view, colors=colors, image=image[0], alpha=alpha[0])
-
-    def _over(self, avatars: Posed, view: SceneView | None, cameras: Cameras, ledger: Ledger) -> Tensor:
-        """The avatars over the scene's own picture."""
-        with ledger.section(BASE):
-            behind: Tensor | float = self.shot.background
-            if view is not None:
-                behind = view.image + self.shot.background * (1 - view.alpha)
-            image, alpha, _ = rasterize(avatars.means, avatars.covars, avatars.opacities, avatars.colors, cameras)
-            return image[0] + behind * (1 - alpha[0])
-
-    def _view(self, cameras: Cameras, offset: tuple[float, float], ledger: Ledger) -> SceneView:
-        """The scene before a camera; made once for each place of a camera that stands still."""
+    def _backdrop(self, cameras: Cameras, offset: tuple[float, float], scenery: _Scenery, ledger: Ledger) -> Backdrop:
+        """The scene, in shadow where avatars cast it, before a camera."""
         if not self.shot.still:
-            return self._look(cameras, ledger)
-        with self._lock:
-            if offset not in self._views:
-                view = self._look(cameras, ledger)
-                if self.plan.on("contact_shadow"):
-                    with ledger.section("contact_shadow"):
-                        eye = cameras.centers[0]
-                        view = replace(view, receivers=contact_shadow.receivers(self.scene.gaussians, view.rows, eye))
-                self._views[offset] = view
-            return self._views[offset]
+            return self._look(cameras, scenery.shadow, ledger)
+        if offset not in scenery.backdrops:
+            with self._lock:
+                if offset not in self._views:
+                    self._views[offset] = self._look(cameras, None, ledger)
+            view = self._views[offset]
+            if scenery.shadow is not None:
+                with ledger.section("contact_shadow"):
+                    view = shaded(view, scenery.shadow, len(self.scene))
+            scenery.backdrops[offset] = view
+        return scenery.backdrops[offset]
 
-    def _look(self, cameras: Cameras, ledger: Ledger) -> SceneView:
-        gaussians, covars, colors = self.scene.gaussians, self.scene.covars, self.scene.gaussians.colors
-        rows = torch.arange(len(self.scene))
+    def _look(self, cameras: Cameras, shadow: contact_shadow.Shadow | None, ledger: Ledger) -> Backdrop:
+        """The scene before a camera, from scratch."""
+        colors = self.scene.gaussians.colors
         if self.plan.on("view_color"):
             with ledger.section("view_color"):
-                colors = view_color.colors_towards(self.scene, rows, cameras)
+                colors = view_color.colors_towards(self.scene, torch.arange(len(self.scene)), cameras)
+        if shadow is not None:
+            with ledger.section("contact_shadow"):
+                colors = colors.clone()
+                colors[shadow.rows] = contact_shadow.darkened(colors[shadow.rows], shadow.light)
         with ledger.section(BASE):
-            if self.plan.on("occlusion") and not self.shot.still:
-                # The joint picture of this frame is the only one that will be drawn from here.
-                nothing = torch.zeros(0)
-                return SceneView(rows, gaussians.means, covars, gaussians.opacities, colors, nothing, nothing)
-            image, alpha, radii = rasterize(gaussians.means, covars, gaussians.opacities, colors, cameras)
-            # What no ray of this camera meets changes no picture: it is left out from here on.
-            rows = torch.nonzero((radii[0] > 0).all(1))[:, 0]
-            kept = (gaussians.means[rows], covars[rows], gaussians.opacities[rows], colors[rows])
-            return SceneView(rows, *kept, image[0], alpha[0])
-
-
-def _joined(posed: Sequence[Posed]) -> Posed:
-    if len(posed) == 1:
-        return posed[0]
-    if not posed:
-        return Posed(torch.zeros(0, 3), torch.zeros(0, 3, 3), torch.zeros(0, 3), torch.zeros(0))
-    return Posed(*(torch.cat([getattr(one, f) for one in posed]) for f in ("means", "covars", "colors", "opacities")))
-
-
-def _between(puppet: Puppet, frame: int, moment: float) -> tuple[Tensor, Tensor]:
-    """Pose and translation a share of a frame after a frame; after the last one, motion goes on as it came."""
-    motion, other, share = puppet.motion, frame + 1, moment
-    if other >= len(motion):
-        frame, other, share = frame - 1, frame, 1 + moment
-    first, second = axis_angle_to_matrix(motion.pose[[frame, other]])
-    pose = matrix_to_axis_angle(slerp(first, second, torch.full((len(first),), share)))
-    return pose, torch.lerp(motion.transl[frame], motion.transl[other], share)
+            # From a moving camera the joint picture of a frame is the only one that is drawn.
+            made = undrawn if self.plan.on("occlusion") and not self.shot.still else look
+            return made(self.scene, colors, cameras, self.shot.background)

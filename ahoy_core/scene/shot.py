@@ -11,12 +11,15 @@ import torch
 from torch import Tensor
 
 from ahoy_core.conventions import GREY, Cameras
-from ahoy_core.scene.cost import RasterLoad, raster_load
+from ahoy_core.scene.cost import RasterLoad, box_load, raster_load
 from ahoy_core.scene.puppet import Puppet
 from ahoy_core.scene.scene import Scene
+from ahoy_core.splat import Window, footprints, hull
 
 # Moments that the planner looks at: enough for a walk to show every phase of a step.
 _MOMENTS = 6
+_REACH = 6.0  # pixels that Gaussians reach beyond their middles
+_NEAR = 0.05  # metres
 
 
 @dataclass(frozen=True)
@@ -106,12 +109,35 @@ class Content:
         return RasterLoad(factor * part.gaussians, factor * part.visible, factor * part.intersections, part.pixels)
 
     @cached_property
+    def scene_boxes(self) -> Tensor:
+        """[N,4] the pixels that each Gaussian of the scene can change, at the first moment."""
+        cameras, gaussians = self.shot.at(self.moments[0]), self.scene.gaussians
+        view, K = cameras.viewmats.contiguous(), cameras.Ks.contiguous()
+        parts = gaussians.means, self.scene.covars, gaussians.opacities
+        return footprints(*parts, view, K, cameras.width, cameras.height)[0]
+
+    @cached_property
     def scene_load(self) -> RasterLoad:
         """Of rendering the scene alone."""
-        if not len(self.scene):
-            return RasterLoad(0, 0, 0, self.pixels)
-        gaussians = self.scene.gaussians
-        return raster_load(gaussians.means, self.scene.covars, gaussians.opacities, self.shot.at(self.moments[0]))
+        cameras = self.shot.cameras
+        return box_load(self.scene_boxes, len(self.scene), (0, 0, cameras.width, cameras.height), picked=False)
+
+    def scene_load_in(self, window: Window | None) -> RasterLoad:
+        """Of rendering the scene into a part of the picture of a camera that stands still."""
+        return RasterLoad(0, 0, 0, 0) if window is None else box_load(self.scene_boxes, 0, window, picked=True)
+
+    @cached_property
+    def avatar_window(self) -> Window | None:
+        """The part of the picture that avatars can change, at the moment when it is of middling size."""
+        found = []
+        for number, frame in enumerate(self.moments):
+            cameras = self.shot.at(frame)
+            corners = []
+            for surfaces in self.surfaces:
+                pixels, depths = cameras.project(surfaces[number][0])
+                corners.append(pixels[0][depths[0] > _NEAR])
+            found.append(_window_of(torch.cat(corners) if corners else torch.zeros(0, 2), cameras))
+        return sorted(found, key=lambda w: 0 if w is None else w[2] * w[3])[len(found) // 2]
 
     @property
     def pixels(self) -> float:
@@ -122,6 +148,13 @@ class Content:
     def avatar_gaussians(self) -> int:
         """Of all avatars together."""
         return sum(len(puppet.avatar) for puppet in self.puppets)
+
+
+def _window_of(pixels: Tensor, cameras: Cameras) -> Window | None:
+    """Round points [M,2] with the reach of the Gaussians on them."""
+    side = torch.tensor([cameras.width, cameras.height] * 2)
+    boxes = torch.cat([pixels - _REACH, pixels + _REACH], 1).clamp(min=0).minimum(side)
+    return hull(boxes.round())
 
 
 def _sum(loads: Sequence[RasterLoad], pixels: float) -> RasterLoad:

@@ -18,6 +18,8 @@ from ahoy_core.splat.cuda import rasterize_cuda
 from ahoy_core.splat.sh import sh_to_colors
 
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
+Window = tuple[int, int, int, int]
+"""Left, top, width and height of a part of an image, pixels."""
 
 
 def rasterization(
@@ -47,6 +49,7 @@ def rasterization(
     transmittance_stop: float = constants.TRANSMITTANCE_STOP,
     memory_budget: int | None = None,
     num_threads: int | None = None,
+    window: Window | None = None,
     **gsplat_only: Any,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Render N Gaussians through C cameras (Kerbl et al. 2023; signature, conventions and meta of gsplat 1.5).
@@ -82,6 +85,8 @@ def rasterization(
         transmittance_stop: A pixel ends before the Gaussian that would take it to this transmittance.
         memory_budget: Bytes that intersections may take (None: half of the machine's memory).
         num_threads: Threads (None: PyTorch's). The image does not depend on it; gradients repeat at a fixed number.
+        window: Draw only these pixels of the image: left, top, width and height; the rest takes no time. The result is
+            that part of the whole image, [C,h,w,D']; meta's means2d and tiles are the window's. CPU only.
         **gsplat_only: Further arguments of gsplat, which are refused unless they ask for nothing.
 
     Returns:
@@ -102,6 +107,8 @@ def rasterization(
         width, height, near_plane, far_plane, radius_clip, eps2d, sh_degree, render_mode, rasterize_mode, camera_model,
         tile_size, alpha_cutoff, transmittance_stop, channel_chunk, memory_budget,
     )  # fmt: skip
+    if window is not None:
+        validate.check_window(window, width, height, means.is_cuda)
     threads = resolve_threads(num_threads)
     if covars is not None:
         quats, scales = None, None
@@ -126,6 +133,10 @@ def rasterization(
     )  # fmt: skip
     flat = colors.flatten(-2) if sh_degree is not None else colors
     projected = project(means, quats, scales, covars, viewmats, Ks, opacities, flat.detach(), view, threads)
+    if window is not None:
+        # Projected as in the whole image, so that what crosses the window's border has the whole image's shape.
+        width, height = window[2:]
+        projected = projected._replace(means2d=projected.means2d - projected.means2d.new_tensor(window[:2]))
     opacities = opacities.expand(len(viewmats), -1)
     if view.antialiased:
         opacities = opacities * projected.compensations

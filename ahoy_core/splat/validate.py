@@ -174,3 +174,12 @@ def check_options(
     _number("transmittance_stop", transmittance_stop, 0.0, 0.99)
     if memory_budget is not None:
         _number("memory_budget", memory_budget, 1, infinity)
+
+
+def check_window(window: tuple[int, int, int, int], width: int, height: int, on_gpu: bool) -> None:
+    """Raise unless a window (left, top, width, height) is a part of the image, on the CPU."""
+    left, top, wide, high = window
+    if not (left >= 0 and top >= 0 and wide >= 1 and high >= 1 and left + wide <= width and top + high <= height):
+        raise ValueError(f"window: expected (left, top, width, height) inside {width}x{height}, got {window}; clip it")
+    if on_gpu:
+        raise NotImplementedError("window: expected tensors on the CPU, got a GPU; render the whole image and crop it")

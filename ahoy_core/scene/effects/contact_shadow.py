@@ -19,23 +19,26 @@ from ahoy_core.scene.cost import Rates
 from ahoy_core.scene.effects.effect import Effect, Verdict
 from ahoy_core.scene.puppet import Points, Puppet
 from ahoy_core.scene.shot import Content
-from ahoy_core.splat.gaussians import Gaussians, quats_to_rotations
+from ahoy_core.splat import Gaussians, Window, hull
+from ahoy_core.splat.gaussians import quats_to_rotations
 
 _STRATA = ((0.06, 110), (0.2, 70), (0.6, 70), (3.0, 70))
 """Heights in the canonical pose, metres, and how many discs stand for the body up to each."""
 OCCLUDERS = sum(count for _, count in _STRATA)
 REACH = 0.9
 """Metres from an avatar's nearest part beyond which its shadow is under 2% and left out."""
+_AT_ONCE = 512  # receivers
+_LEAST_TAKEN = 1 / 256  # of the light: sRGB changes by a 2.4th of the share at most, here by less than half a step
 _MOST_LIFT = 0.3  # metres: a body higher than this over the ground has no contact to show
 _LEAST_PIXELS = 6  # height in pixels of the shadow's reach on the ground, under which nobody sees it
 
 
 @dataclass(frozen=True)
-class Receivers:
-    """R scene Gaussians that may be shaded: positions [R,3] and normals [R,3] towards the camera."""
+class Shadow:
+    """Which Gaussians of a scene [K] are darker by it, and the share of light [K] that is left to each."""
 
-    means: Tensor
-    normals: Tensor
+    rows: Tensor
+    light: Tensor
 
 
 def occluders(puppet: Puppet) -> Points:
@@ -54,14 +57,10 @@ def occluders(puppet: Puppet) -> Points:
     return Points(picked.means, picked.normals, torch.cat(areas), picked.lbs_weights)
 
 
-def receivers(gaussians: Gaussians, rows: Tensor, eye: Tensor) -> Receivers:
-    """Those of the scene's Gaussians `rows` that can receive a shadow, seen from `eye` [3]."""
-    scales = gaussians.scales[rows]
-    axes = quats_to_rotations(gaussians.quats[rows])
-    normals = axes.gather(2, scales.argmin(1)[:, None, None].expand(-1, 3, 1))[:, :, 0]
-    means = gaussians.means[rows]
-    facing = ((eye - means) * normals).sum(1, keepdim=True)
-    return Receivers(means, torch.where(facing < 0, -normals, normals))
+def short_axes(gaussians: Gaussians) -> Tensor:
+    """[N,3]: the direction in which each Gaussian is thinnest, which is its surface's normal but for the sign."""
+    axes = quats_to_rotations(gaussians.quats)
+    return axes.gather(2, gaussians.scales.argmin(1)[:, None, None].expand(-1, 3, 1))[:, :, 0]
 
 
 def sky_share(points: Tensor, normals: Tensor, places: Tensor, facing: Tensor, areas: Tensor) -> Tensor:
@@ -74,7 +73,12 @@ def sky_share(points: Tensor, normals: Tensor, places: Tensor, facing: Tensor, a
         facing: [D,3] their normals.
         areas: [D] m².
     """
-    # Squares and products by matrix multiplication: [R,D] arrays are all the memory this takes.
+    parts = zip(points.split(_AT_ONCE), normals.split(_AT_ONCE), strict=True)
+    return torch.cat([_share(p, n, places, facing, areas) for p, n in parts]) if len(points) else points.new_zeros(0)
+
+
+def _share(points: Tensor, normals: Tensor, places: Tensor, facing: Tensor, areas: Tensor) -> Tensor:
+    # Squares and products by matrix multiplication: a few [R,D] arrays, which stay in the cache.
     square = torch.cdist(points, places).square_().clamp_(min=1e-8)
     inverse = square.rsqrt()
     at_point = (normals @ places.T - (normals * points).sum(1, keepdim=True)).mul_(inverse).clamp_(min=0)
@@ -83,31 +87,34 @@ def sky_share(points: Tensor, normals: Tensor, places: Tensor, facing: Tensor, a
     return (1 - covered.sum(1)).clamp(min=0)
 
 
-def shade(colors: Tensor, to: Receivers, discs: list[Points], relative: list[Tensor], strength: float = 1.0) -> Tensor:
-    """Colours of the scene with the avatars' shadows.
+def cast(
+    means: Tensor, axes: Tensor, eye: Tensor, discs: list[Points], relative: list[Tensor], strength: float = 1.0
+) -> Shadow:
+    """The shadow of avatars on a scene; light that they take by less than half a step of 8 bits is not counted.
 
     Args:
-        colors: [R,3] sRGB of the receivers.
-        to: The receivers.
+        means: [N,3] the scene's Gaussians.
+        axes: [N,3] theirs (`short_axes`).
+        eye: [3] from where they are seen, which tells front from back.
         discs: One set an avatar.
         relative: [J,4,4] an avatar: its joints' transforms in this frame.
         strength: 1 for the share of light that is taken; less for a lighter shadow.
-
-    Returns:
-        [R,3]; the input itself where no receiver is within reach.
     """
     posed = [points.posed(one) for points, one in zip(discs, relative, strict=True)]
     places, facing = torch.cat([p for p, _ in posed]), torch.cat([n for _, n in posed])
     areas = torch.cat([points.areas for points in discs])
     low, high = places.amin(0) - REACH, places.amax(0) + REACH
-    near = ((to.means > low) & (to.means < high)).all(1)
-    if not bool(near.any()):
-        return colors
-    share = sky_share(to.means[near], to.normals[near], places, facing, areas)
-    factor = 1 - strength * (1 - share)
-    shaded = colors.clone()
-    shaded[near] = to_srgb(to_linear(colors[near]) * factor[:, None])
-    return shaded
+    rows = torch.nonzero(((means > low) & (means < high)).all(1))[:, 0]
+    near, normals = means[rows], axes[rows]
+    normals = torch.where(((eye - near) * normals).sum(1, keepdim=True) < 0, -normals, normals)
+    light = 1 - strength * (1 - sky_share(near, normals, places, facing, areas))
+    dark = light < 1 - _LEAST_TAKEN
+    return Shadow(rows[dark], light[dark])
+
+
+def darkened(colors: Tensor, light: Tensor) -> Tensor:
+    """Colours [K,3] sRGB with a share [K] of their light."""
+    return to_srgb(to_linear(colors) * light[:, None])
 
 
 def _judge(content: Content) -> Verdict:
@@ -145,14 +152,39 @@ def _ground_in_view(content: Content, places: Tensor, cameras: Cameras) -> tuple
 
 
 def _seconds(content: Content, verdict: Verdict, rates: Rates) -> float:
+    """Of the shadow, and of drawing the scene again where it is (a moving camera draws it anyway)."""
     near = 0
     for surfaces in content.surfaces:
         places = surfaces[len(surfaces) // 2][0]
         inside = (content.scene.gaussians.means > places.amin(0) - REACH).all(1)
         near += int((inside & (content.scene.gaussians.means < places.amax(0) + REACH).all(1)).sum())
     discs = OCCLUDERS * len(content.puppets)
-    frame = near * (discs * rates.pair + rates.shade) + len(content.scene) * rates.gaussian
-    return content.frames * (frame + len(content.puppets) * rates.joints)
+    frame = near * (discs * rates.pair + rates.shade) + len(content.scene) * rates.pick
+    return content.frames * (frame + len(content.puppets) * rates.joints + redraw_seconds(content, rates))
+
+
+def redraw_seconds(content: Content, rates: Rates) -> float:
+    """CPU-seconds of drawing the scene once again where shadows are."""
+    if not content.shot.still:
+        return 0.0
+    load = content.scene_load_in(_window(content))
+    return rates.raster(load) + len(content.scene) * rates.pick + content.pixels * rates.paste
+
+
+def _window(content: Content) -> Window | None:
+    """Where a shadow shows at a middle moment, found with every sixth disc and every fourth Gaussian."""
+    frame = content.moments[len(content.moments) // 2]
+    gaussians, cameras = content.scene.gaussians, content.shot.at(frame)
+    rows = torch.arange(0, len(content.scene), 4)
+    discs, relative = [], []
+    for puppet in content.puppets:
+        some = occluders(puppet)
+        some = some[torch.arange(0, len(some), 6)]
+        discs.append(Points(some.means, some.normals, 6 * some.areas, some.lbs_weights))
+        relative.append(puppet.relative(puppet.motion.pose[[frame]], puppet.motion.transl[[frame]])[0])
+    axes = short_axes(gaussians)[rows]
+    shadow = cast(gaussians.means[rows], axes, cameras.centers[0], discs, relative)
+    return hull(content.scene_boxes[rows][shadow.rows])
 
 
 CONTACT_SHADOW = Effect(

@@ -10,9 +10,10 @@ import torch
 from torch import Tensor
 
 from ahoy_core.conventions import Cameras
-from ahoy_core.scene.cost import Rates, footprints
+from ahoy_core.scene.cost import Rates
 from ahoy_core.scene.effects.effect import Effect, Verdict
 from ahoy_core.scene.shot import Content
+from ahoy_core.splat.constants import ALPHA_CUTOFF
 
 # Pixels of a cell of the depth maps that are compared.
 _CELL = 4
@@ -22,6 +23,7 @@ _LEAST = 0.002
 # Metres: nearer than this to the surface counts as touching, not as in front.
 _TOUCH = 0.01
 _FAINT = 0.05
+_NEAR = 0.05  # metres: what is nearer to the camera is not in the picture
 
 
 def hidden_share(content: Content) -> float:
@@ -41,7 +43,7 @@ def hidden_share(content: Content) -> float:
 
 def _nearest(means: Tensor, covars: Tensor, opacities: Tensor, cameras: Cameras) -> list[Tensor]:
     """Depth maps of the scene's nearest Gaussians, one for each octave of their radius, in cells that grow with it."""
-    u, v, radius, depth = footprints(means, covars, opacities, cameras)
+    u, v, radius, depth = _circles(means, covars, opacities, cameras)
     octave = torch.log2((radius / _CELL).clamp(min=1)).ceil().clamp(max=_LEVELS - 1).long()
     # Three quarters of the cut-off radius hold what is visibly dense.
     maps = []
@@ -49,7 +51,7 @@ def _nearest(means: Tensor, covars: Tensor, opacities: Tensor, cameras: Cameras)
         size = _CELL << level
         wide, high = -(-cameras.width // size), -(-cameras.height // size)
         flat = torch.full((high * wide,), torch.inf)
-        mine = (octave == level) & (depth > 0.05)
+        mine = (octave == level) & (depth > _NEAR)
         x, y = (u[mine] / size).floor().long(), (v[mine] / size).floor().long()
         inside = (x >= 0) & (x < wide) & (y >= 0) & (y < high)
         flat.scatter_reduce_(0, y[inside] * wide + x[inside], depth[mine][inside].float(), "amin")
@@ -57,11 +59,25 @@ def _nearest(means: Tensor, covars: Tensor, opacities: Tensor, cameras: Cameras)
     return maps
 
 
+def _circles(
+    means: Tensor, covars: Tensor, opacities: Tensor, cameras: Cameras
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Where Gaussians are in the picture of the first camera: u, v, radius [N] in pixels and depth [N] in metres."""
+    viewmat, K = cameras.viewmats[0].to(means), cameras.Ks[0].to(means)
+    camera = means @ viewmat[:3, :3].T + viewmat[:3, 3]
+    depth = camera[:, 2]
+    near = depth.clamp(min=_NEAR)
+    u, v = (K[i, i] * camera[:, i] / near + K[i, 2] for i in (0, 1))
+    sigmas = (2 * torch.log((opacities / ALPHA_CUTOFF).clamp(min=1))).sqrt()
+    extent = (covars.diagonal(dim1=1, dim2=2).sum(1).clamp(min=0) / 2).sqrt() * K[0, 0] / near
+    return u, v, sigmas * (extent + 0.5), depth
+
+
 def _behind(places: Tensor, near: list[Tensor], cameras: Cameras) -> tuple[int, int]:
     """Of an avatar's cells: those that have something nearer, and all."""
     pixels, depths = cameras.project(places)
     u, v, depth = pixels[0, :, 0], pixels[0, :, 1], depths[0]
-    shown = (depth > 0.05) & (u >= 0) & (u < cameras.width) & (v >= 0) & (v < cameras.height)
+    shown = (depth > _NEAR) & (u >= 0) & (u < cameras.width) & (v >= 0) & (v < cameras.height)
     if not bool(shown.any()):
         return 0, 0
     u, v, depth = u[shown], v[shown], depth[shown]
@@ -93,7 +109,15 @@ def _judge(content: Content) -> Verdict:
 
 def _seconds(content: Content, verdict: Verdict, rates: Rates) -> float:
     """Of the joint pictures, which take the place of the avatars' own."""
-    return content.frames * rates.raster(content.avatar_load.plus(content.scene_load))
+    return content.frames * joint_seconds(content, rates)
+
+
+def joint_seconds(content: Content, rates: Rates) -> float:
+    """CPU-seconds of one joint picture: of all of it, or of the avatars' window before a camera that stands still."""
+    if not content.shot.still:
+        return rates.raster(content.avatar_load.plus(content.scene_load))
+    load = content.avatar_load._replace(pixels=0.0).plus(content.scene_load_in(content.avatar_window))
+    return rates.raster(load) + len(content.scene) * rates.pick + content.pixels * rates.paste
 
 
 OCCLUSION = Effect(

@@ -168,10 +168,10 @@ def posing(content: Content, rates: Rates) -> float:
 
 
 def _seconds(content: Content, verdict: Verdict, rates: Rates) -> float:
-    """Of the samples beyond the first, as if every one were a joint picture."""
-    one = rates.raster(content.avatar_load.plus(content.scene_load))
-    one += posing(content, rates) + content.pixels * rates.blend
-    return content.frames * (max(1, verdict.quality) - 1) * one
+    """Of the samples beyond the first but for drawing them, which depends on the other effects (see plan.py)."""
+    more = max(1, verdict.quality) - 1
+    between = content.pixels * rates.blend + content.avatar_gaussians * rates.curve
+    return content.frames * more * between
 
 
 def _can_blur(content: Content) -> bool:
