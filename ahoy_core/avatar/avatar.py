@@ -10,6 +10,7 @@ import torch
 from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor
 
+from ahoy_core.avatar.counting import multiplications
 from ahoy_core.avatar.deform import Canonical, OffsetBounds, apply_offsets, deform, dense_weights
 from ahoy_core.avatar.head import expression_basis
 from ahoy_core.avatar.kinematics import Kinematics
@@ -47,7 +48,7 @@ class Posed:
 
 
 @dataclass(frozen=True)
-class _Ready:
+class Mapped:
     """Gaussians for one map pose, with the covariances [N,3,3] and dense skinning weights [N,J] that follow."""
 
     rotations: Tensor
@@ -148,6 +149,7 @@ class Avatar:
         expression: Tensor | None = None,
         pose_strength: float | None = None,
         face: Tensor | None = None,
+        mapped: Mapped | None = None,
     ) -> Posed:
         """Pose the avatar.
 
@@ -159,19 +161,16 @@ class Avatar:
             pose_strength: How far a full avatar's map pose is pulled to the training poses, [0,1]; as stored by
                 default. The skeleton always follows `pose`.
             face: [N,3] what `face_offset` gives, in place of an expression.
+            mapped: The Gaussians of another map pose (`mapped`), for poses so close to it that theirs would not differ.
 
         Raises:
             ValueError: If the body is another one, or the pose or expression has another shape or is not finite.
         """
-        if body.name != self.info.body:
-            raise ValueError(f"expected body {self.info.body!r}, got {body.name!r}; convert the motion, not the avatar")
-        if tuple(pose.shape) != (body.n_joints, 3) or not bool(torch.isfinite(pose).all()):
-            raise ValueError(f"expected a finite pose ({body.n_joints}, 3), got {tuple(pose.shape)}; leave frame out")
+        rotations = self._rotations(body, pose)
         kinematics = self._kinematics(body)
         place = torch.zeros(3) if transl is None else transl
-        rotations = axis_angle_to_matrix(pose.to(self.means))
         relative = kinematics.relative(rotations[None], place[None].to(self.means))[0]
-        ready = self._ready(kinematics, rotations, pose_strength)
+        ready = self._ready(kinematics, rotations, pose_strength) if mapped is None else mapped
         means = ready.canonical.means
         if expression is not None:
             face = self.face_offset(body, expression)
@@ -180,20 +179,45 @@ class Avatar:
         means, covars = deform(means, ready.covars, ready.lbs_weights, relative)
         return Posed(means, covars, ready.canonical.colors, ready.canonical.opacities)
 
+    def mapped(self, body: BodyModel, pose: Tensor, pose_strength: float | None = None) -> Mapped:
+        """The canonical Gaussians of a map pose [J,3], for `pose`.
+
+        Raises:
+            ValueError: As `pose`.
+        """
+        return self._ready(self._kinematics(body), self._rotations(body, pose), pose_strength)
+
+    def _rotations(self, body: BodyModel, pose: Tensor) -> Tensor:
+        if body.name != self.info.body:
+            raise ValueError(f"expected body {self.info.body!r}, got {body.name!r}; convert the motion, not the avatar")
+        if tuple(pose.shape) != (body.n_joints, 3) or not bool(torch.isfinite(pose).all()):
+            raise ValueError(f"expected a finite pose ({body.n_joints}, 3), got {tuple(pose.shape)}; leave frame out")
+        return axis_angle_to_matrix(pose.to(self.means))
+
+    def map_work(self, body: BodyModel) -> int:
+        """Multiplications of a map pose's convolutions; 0 for a coarse avatar, whose Gaussians do not depend on it."""
+        if self.posing is None:
+            return 0
+        if "work" not in self._found:
+            self._found.pop("ready", None)
+            still = torch.zeros(body.n_joints, 3)
+            self._found["work"] = multiplications(self.network, lambda: self.mapped(body, still))
+        return cast(int, self._found["work"])
+
     def _kinematics(self, body: BodyModel) -> Kinematics:
         if "kinematics" not in self._found:
             self._found["kinematics"] = Kinematics.of(body, self.betas)
         return cast(Kinematics, self._found["kinematics"])
 
-    def _ready(self, kinematics: Kinematics, rotations: Tensor, strength: float | None) -> _Ready:
+    def _ready(self, kinematics: Kinematics, rotations: Tensor, strength: float | None) -> Mapped:
         """What skinning takes; a full avatar's is kept until the next map pose."""
-        last = cast("_Ready | None", self._found.get("ready"))
+        last = cast("Mapped | None", self._found.get("ready"))
         if last is not None and (self.posing is None or last.serves(rotations, strength)):
             return last
         if self.posing is None:
             turned = quaternion_to_matrix(self.quats)
             made = Canonical(self.means, turned, self.scales, self.opacities, self.colors, self.skin_weights)
-            ready = _Ready(rotations, strength, made, self.covars, self.lbs_weights)
+            ready = Mapped(rotations, strength, made, self.covars, self.lbs_weights)
         else:
             maps = cast(
                 PoseMaps,
@@ -201,7 +225,7 @@ class Avatar:
             )
             made = self.posing.gaussians(maps, self.network, self.bounds, rotations, strength)
             dense = dense_weights(self.skin_indices, made.skin_weights, kinematics.n_joints)
-            ready = _Ready(rotations, strength, made, made.covars(), dense)
+            ready = Mapped(rotations, strength, made, made.covars(), dense)
         self._found["ready"] = ready
         return ready
 

@@ -49,6 +49,7 @@ class Rates:
         gaussian, visible, intersection, pixel: Of the rasterizer, per unit of `RasterLoad`.
         skin: Per avatar and frame: its body posed.
         joints: Per avatar and frame: its joints' transforms alone.
+        map: Per multiplication of the network that gives a full avatar its Gaussians for a pose.
         pose: Per Gaussian of an avatar that is posed.
         carry: Per surface point whose normal is carried along.
         pair: Per pair of occluder and receiver of a contact shadow.
@@ -67,6 +68,7 @@ class Rates:
     pixel: float = 1.8e-8
     skin: float = 0.0035
     joints: float = 0.0025
+    map: float = 3.3e-10
     pose: float = 3.7e-7
     carry: float = 2.4e-7
     pair: float = 6.5e-9

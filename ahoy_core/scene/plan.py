@@ -7,13 +7,15 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from ahoy_core.scene.cost import Rates
+from ahoy_core.scene.effects.ambient_occlusion import AMBIENT_OCCLUSION
 from ahoy_core.scene.effects.contact_shadow import CONTACT_SHADOW, redraw_seconds
 from ahoy_core.scene.effects.effect import Effect, Verdict
 from ahoy_core.scene.effects.expression import EXPRESSION
 from ahoy_core.scene.effects.foot_contact import FOOT_CONTACT
 from ahoy_core.scene.effects.light import LIGHT
 from ahoy_core.scene.effects.occlusion import OCCLUSION, joint_seconds
-from ahoy_core.scene.effects.sampling import DEPTH_OF_FIELD, MOTION_BLUR, posing
+from ahoy_core.scene.effects.sampling import DEPTH_OF_FIELD, MOTION_BLUR, mapping, posing
+from ahoy_core.scene.effects.secondary_motion import SECONDARY_MOTION
 from ahoy_core.scene.effects.view_color import VIEW_COLOR
 from ahoy_core.scene.exposure import KNOTS
 from ahoy_core.scene.puppet import Puppet
@@ -22,8 +24,10 @@ from ahoy_core.scene.shot import Content, Shot
 
 EFFECTS: tuple[Effect, ...] = (
     FOOT_CONTACT,
+    SECONDARY_MOTION,
     EXPRESSION,
     LIGHT,
+    AMBIENT_OCCLUSION,
     VIEW_COLOR,
     CONTACT_SHADOW,
     OCCLUSION,
@@ -33,7 +37,7 @@ EFFECTS: tuple[Effect, ...] = (
 """In the order in which they are applied: motion, face, colours, shadows, compositing, then samples over all of it."""
 EFFECT_NAMES = tuple(effect.name for effect in EFFECTS)
 BASE = "base"
-STRENGTHS: Mapping[str, float] = {"light": 0.6, "contact_shadow": 1.0}
+STRENGTHS: Mapping[str, float] = {"light": 0.6, "ambient_occlusion": 1.0, "contact_shadow": 1.0}
 """Knobs in [0,1] and their defaults. Light is held back, as what an avatar was filmed under is a guess."""
 
 
@@ -151,7 +155,7 @@ def base_seconds(content: Content, rates: Rates, joint: bool = False) -> float:
         rates: Of this machine.
         joint: Avatars and scene are drawn together, which is the work of an effect.
     """
-    each = posing(content, rates) + content.pixels * rates.write
+    each = mapping(content, rates) + posing(content, rates) + content.pixels * rates.write
     each += 0.0 if joint else over_seconds(content, rates)
     views = 1 if content.shot.still else 0 if joint else content.frames
     drawn = rates.raster(content.scene_load) if len(content.scene) else 0.0

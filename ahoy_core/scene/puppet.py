@@ -9,7 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
+import numpy as np
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from ahoy_core.avatar.avatar import Avatar
@@ -87,6 +89,19 @@ class Puppet:
         chosen = self.points[torch.arange(0, len(self.points), step)]
         share = float(self.points.areas.sum() / chosen.areas.sum().clamp(min=1e-12))
         return Points(chosen.means, chosen.normals, chosen.areas * share, chosen.lbs_weights)
+
+    @cached_property
+    def _nearest(self) -> tuple[Tensor, Tensor]:
+        """For each Gaussian: the three nearest of the sample [N,3], and their weights by inverse distance [N,3]."""
+        found = cKDTree(self.sample.means.numpy()).query(self.points.means.numpy(), min(3, len(self.sample)))
+        distance, rows = (torch.from_numpy(np.asarray(x).reshape(len(self.points), -1)) for x in found)
+        weights = 1 / (distance.float() + 1e-4)
+        return rows, weights / weights.sum(1, keepdim=True)
+
+    def spread(self, values: Tensor) -> Tensor:
+        """Values of the sample [M,...] brought to all Gaussians [N,...]."""
+        rows, weights = self._nearest
+        return torch.einsum("nk,nk...->n...", weights, values[rows])
 
     def surface(self, frames: list[int]) -> list[tuple[Tensor, Tensor]]:
         """Positions and normals of the sample at each of these frames."""

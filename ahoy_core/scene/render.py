@@ -14,13 +14,21 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ahoy_core.avatar.avatar import Posed
+from ahoy_core.avatar.avatar import Mapped, Posed
 from ahoy_core.conventions import Cameras
 from ahoy_core.formats.images import to_uint8
 from ahoy_core.scene.backdrop import Backdrop, look, shaded, together, undrawn, with_avatars
 from ahoy_core.scene.color import to_linear, to_srgb
 from ahoy_core.scene.cost import Ledger
-from ahoy_core.scene.effects import contact_shadow, foot_contact, light, sampling, view_color
+from ahoy_core.scene.effects import (
+    ambient_occlusion,
+    contact_shadow,
+    foot_contact,
+    light,
+    sampling,
+    secondary_motion,
+    view_color,
+)
 from ahoy_core.scene.exposure import Exposure, at_moment, knots
 from ahoy_core.scene.plan import BASE, Plan
 from ahoy_core.scene.puppet import Points, Puppet
@@ -61,10 +69,20 @@ class Stage:
                 around = [light.surroundings(self.scene, light.chest(content, i)) for i in range(len(self.puppets))]
                 self._lights = [light.irradiance(linear) for linear, _ in around]
         self._discs: list[Points] = []
+        casting = [name for name in ("contact_shadow", "ambient_occlusion") if self.plan.on(name)]
+        if casting:
+            with self.ledger.section(casting[0]):
+                self._discs = [contact_shadow.occluders(puppet) for puppet in self.puppets]
         if self.plan.on("contact_shadow"):
             with self.ledger.section("contact_shadow"):
-                self._discs = [contact_shadow.occluders(puppet) for puppet in self.puppets]
-                self._axes = contact_shadow.short_axes(self.scene.gaussians)
+                self._axes = contact_shadow.short_axes(self.scene.gaussians.quats, self.scene.gaussians.scales)
+        if self.plan.on("ambient_occlusion"):
+            with self.ledger.section("ambient_occlusion"):
+                self._nearby = ambient_occlusion.surfaces_of(self.scene, *ambient_occlusion.extent(content))
+        self._swings: list[secondary_motion.Swing | None] = [None] * len(self.puppets)
+        if self.plan.on("secondary_motion"):
+            with self.ledger.section("secondary_motion"):
+                self._swings = [secondary_motion.swing_of(puppet) for puppet in self.puppets]
         self._focus = sampling.focus_of(content) if self.plan.on("depth_of_field") else 1.0
         moving, lens = self.plan.on("motion_blur"), self.plan.on("depth_of_field")
         count = self.plan.samples
@@ -97,51 +115,67 @@ class Stage:
         """A frame's avatars, posed and lit, and what they do to the scene; light and shadow are those of its middle."""
         moments = knots([sample.moment for sample in self._samples])
         middle = moments[len(moments) // 2]
-        lit, relative = self._lit(frame, middle, self._posed(frame, middle, self.ledger))
+        mapped = self._mapped(frame, middle)
+        lit, relative = self._lit(frame, middle, self._posed(frame, middle, mapped, self.ledger))
         shadow = None
         if self.plan.on("contact_shadow"):
             with self.ledger.section("contact_shadow"):
                 eye, strength = self.shot.at(frame).centers[0], self.plan.strength("contact_shadow")
-                means = self.scene.gaussians.means
-                shadow = contact_shadow.cast(means, self._axes, eye, self._discs, relative, strength)
+                discs = contact_shadow.carried(self._discs, relative)
+                shadow = contact_shadow.cast(self.scene.gaussians.means, self._axes, eye, discs, strength)
         shown = together(lit)
         posed = {middle: shown}
         for moment in moments:
             if moment != middle:
                 with self.ledger.section(self._blur):
-                    there = together(self._posed(frame, moment, Ledger()))
+                    there = together(self._posed(frame, moment, mapped, Ledger()))
                     posed[moment] = replace(there, colors=shown.colors)
         return Exposure(moments, tuple(posed[moment] for moment in moments)), _Scenery(shadow)
 
-    def _posed(self, frame: int, moment: float, ledger: Ledger) -> list[Posed]:
+    def _mapped(self, frame: int, moment: float) -> list[Mapped]:
+        """Each avatar's canonical Gaussians for a pose; in an exposure poses differ too little to change them."""
+        with self.ledger.section(BASE):
+            poses = [at_moment(puppet.motion, frame, moment)[0] for puppet in self.puppets]
+            return [p.avatar.mapped(p.body, pose) for p, pose in zip(self.puppets, poses, strict=True)]
+
+    def _posed(self, frame: int, moment: float, mapped: list[Mapped], ledger: Ledger) -> list[Posed]:
         """Each avatar a share of a frame after a frame, in its own colours."""
         made = []
-        for puppet in self.puppets:
+        for puppet, own, swing in zip(self.puppets, mapped, self._swings, strict=True):
             pose, transl = at_moment(puppet.motion, frame, moment)
             face = None
             if self.plan.on("expression") and puppet.motion.expression is not None:
                 with ledger.section("expression"):
                     face = puppet.avatar.face_offset(puppet.body, puppet.motion.expression[frame])
             with ledger.section(BASE):
-                made.append(puppet.avatar.pose(puppet.body, pose, transl, face=face))
+                made.append(puppet.avatar.pose(puppet.body, pose, transl, face=face, mapped=own))
+            if swing is not None:
+                with ledger.section("secondary_motion"):
+                    made[-1] = replace(made[-1], means=swing.moved(made[-1].means, frame, moment))
         return made
 
     def _lit(self, frame: int, moment: float, posed: list[Posed]) -> tuple[list[Posed], list[Tensor]]:
         """The same in the scene's light, and their joints' transforms, as far as an effect needs them."""
-        if not (self.plan.on("light") or self.plan.on("contact_shadow")):
+        needing = [n for n in ("light", "ambient_occlusion", "contact_shadow") if self.plan.on(n)]
+        if not needing:
             return posed, []
-        lit, relative = [], []
-        for number, (puppet, one) in enumerate(zip(self.puppets, posed, strict=True)):
-            with self.ledger.section("light" if self.plan.on("light") else "contact_shadow"):
-                pose, transl = at_moment(puppet.motion, frame, moment)
-                relative.append(puppet.relative(pose[None], transl[None])[0])
-            if self.plan.on("light"):
-                with self.ledger.section("light"):
-                    _, normals = puppet.points.posed(relative[-1])
-                    strength = self.plan.strength("light")
-                    one = replace(one, colors=light.relight(one.colors, normals, self._lights[number], strength))
-            lit.append(one)
-        return lit, relative
+        with self.ledger.section(needing[0]):
+            poses = [at_moment(puppet.motion, frame, moment) for puppet in self.puppets]
+            relative = [p.relative(a[None], t[None])[0] for p, (a, t) in zip(self.puppets, poses, strict=True)]
+        colors = [one.colors for one in posed]
+        if self.plan.on("light"):
+            with self.ledger.section("light"):
+                strength = self.plan.strength("light")
+                for i, puppet in enumerate(self.puppets):
+                    _, normals = puppet.points.posed(relative[i])
+                    colors[i] = light.relight(colors[i], normals, self._lights[i], strength)
+        if self.plan.on("ambient_occlusion"):
+            with self.ledger.section("ambient_occlusion"):
+                strength, discs = self.plan.strength("ambient_occlusion"), contact_shadow.carried(self._discs, relative)
+                for i, puppet in enumerate(self.puppets):
+                    left = ambient_occlusion.light_left(*puppet.sample.posed(relative[i]), self._nearby, discs)
+                    colors[i] = ambient_occlusion.darkened(colors[i], left, puppet, strength)
+        return [replace(one, colors=own) for one, own in zip(posed, colors, strict=True)], relative
 
     def _sample(
         self, frame: int, sample: sampling.Sample, exposure: Exposure, scenery: _Scenery, ledger: Ledger

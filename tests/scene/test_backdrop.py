@@ -50,8 +50,9 @@ def test_a_shadow_drawn_in_its_window_is_that_of_the_whole_scene_recoloured():
     who, _ = at((0.0, 0.0, 0.0))
     g = scene.gaussians
     relative = who.relative(who.motion.pose[:1], who.motion.transl[:1])[0]
-    axes = contact_shadow.short_axes(g)
-    shadow = contact_shadow.cast(g.means, axes, cameras.centers[0], [contact_shadow.occluders(who)], [relative])
+    axes = contact_shadow.short_axes(g.quats, g.scales)
+    discs = contact_shadow.carried([contact_shadow.occluders(who)], [relative])
+    shadow = contact_shadow.cast(g.means, axes, cameras.centers[0], discs)
     found = shaded(look(scene, g.colors, cameras, 0.5), shadow, len(scene))
     colors = g.colors.clone()
     colors[shadow.rows] = contact_shadow.darkened(colors[shadow.rows], shadow.light)

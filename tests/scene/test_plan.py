@@ -20,6 +20,7 @@ from ahoy_core.scene.puppet import Puppet
 from ahoy_core.scene.render import Stage
 from ahoy_core.scene.scene import Scene, empty_scene, make_scene
 from ahoy_core.scene.shot import Shot
+from tests.scene.test_secondary_motion import shaken, skirted
 from tests.scene.things import avatar, camera, flat, floor, full_avatar, moved, puppet, room, smiling, wall
 
 NEAR = camera((0.0, -1.2, 1.6), (0.0, 0.0, 1.5))
@@ -51,6 +52,14 @@ CALLS = {
     "contact_shadow": (
         lambda: (floor(), puppet(), Shot(camera())),
         lambda: (floor(), puppet(), Shot(NEAR)),
+    ),
+    "ambient_occlusion": (
+        lambda: (floor(), puppet(), Shot(camera((0.4, -1.0, 0.3), (0.0, 0.0, 0.1)))),
+        lambda: (floor(), puppet(), Shot(NEAR)),
+    ),
+    "secondary_motion": (
+        lambda: (empty_scene(), shaken(skirted(puppet(frames=12, fps=12.0))), Shot(camera())),
+        lambda: (empty_scene(), skirted(puppet(frames=12, fps=12.0)), Shot(camera())),
     ),
     "occlusion": (
         lambda: (wall(-1.0), puppet(), Shot(camera((0.0, -4.0, 1.0), (0.0, 0.0, 1.0)))),

@@ -49,8 +49,8 @@ def test_contact_shadow_is_that_of_rays(motion: str):
     truth = ray_cast_sky(mesh, points.numpy())
     up = torch.tensor([0.0, 0, 1]).expand(len(points), 3)
     discs = contact_shadow.occluders(who)
-    places, facing = discs.posed(who.relative(pose, transl)[0])
-    found = contact_shadow.sky_share(points, up, places, facing, discs.areas).numpy()
+    carried = contact_shadow.carried([discs], [who.relative(pose, transl)[0]])
+    found = contact_shadow.sky_share(points, up, carried).numpy()
     seen = truth > 0.25  # what is darker lies under a sole, where nobody sees it
     error = float(np.sqrt(np.mean((found - truth)[seen] ** 2)))
     nothing = float(np.sqrt(np.mean((1 - truth)[seen] ** 2)))

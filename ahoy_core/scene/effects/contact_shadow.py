@@ -9,6 +9,7 @@ that is its outline, once. Reference: ray casting, tests/scene/test_contact_shad
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -19,7 +20,7 @@ from ahoy_core.scene.cost import Rates
 from ahoy_core.scene.effects.effect import Effect, Verdict
 from ahoy_core.scene.puppet import Points, Puppet
 from ahoy_core.scene.shot import Content
-from ahoy_core.splat import Gaussians, Window, hull
+from ahoy_core.splat import Window, hull
 from ahoy_core.splat.gaussians import quats_to_rotations
 
 _STRATA = ((0.06, 110), (0.2, 70), (0.6, 70), (3.0, 70))
@@ -31,6 +32,14 @@ _AT_ONCE = 512  # receivers
 _LEAST_TAKEN = 1 / 256  # of the light: sRGB changes by a 2.4th of the share at most, here by less than half a step
 _MOST_LIFT = 0.3  # metres: a body higher than this over the ground has no contact to show
 _LEAST_PIXELS = 6  # height in pixels of the shadow's reach on the ground, under which nobody sees it
+
+
+class Discs(NamedTuple):
+    """D discs in the world: places [D,3], unit normals [D,3], areas [D] m²."""
+
+    places: Tensor
+    facing: Tensor
+    areas: Tensor
 
 
 @dataclass(frozen=True)
@@ -57,57 +66,66 @@ def occluders(puppet: Puppet) -> Points:
     return Points(picked.means, picked.normals, torch.cat(areas), picked.lbs_weights)
 
 
-def short_axes(gaussians: Gaussians) -> Tensor:
-    """[N,3]: the direction in which each Gaussian is thinnest, which is its surface's normal but for the sign."""
-    axes = quats_to_rotations(gaussians.quats)
-    return axes.gather(2, gaussians.scales.argmin(1)[:, None, None].expand(-1, 3, 1))[:, :, 0]
+def short_axes(quats: Tensor, scales: Tensor) -> Tensor:
+    """[N,3]: the direction in which Gaussians are thinnest, which is their surface's normal but for the sign.
+
+    Args:
+        quats: [N,4] wxyz.
+        scales: [N,3].
+    """
+    axes = quats_to_rotations(quats)
+    return axes.gather(2, scales.argmin(1)[:, None, None].expand(-1, 3, 1))[:, :, 0]
 
 
-def sky_share(points: Tensor, normals: Tensor, places: Tensor, facing: Tensor, areas: Tensor) -> Tensor:
+def carried(discs: list[Points], relative: list[Tensor]) -> Discs:
+    """All avatars' discs in a frame, each set under its joints' transforms [J,4,4]."""
+    posed = [points.posed(one) for points, one in zip(discs, relative, strict=True)]
+    areas = torch.cat([points.areas for points in discs])
+    return Discs(torch.cat([p for p, _ in posed]), torch.cat([n for _, n in posed]), areas)
+
+
+def sky_share(points: Tensor, normals: Tensor, discs: Discs, dark: Tensor | None = None) -> Tensor:
     """The share [R] of each point's light that discs let through.
 
     Args:
         points: [R,3] receivers.
         normals: [R,3] theirs.
-        places: [D,3] discs.
-        facing: [D,3] their normals.
-        areas: [D] m².
+        discs: D discs.
+        dark: [D] the share of the covered light that each takes; all of it by default.
     """
+    if not len(points):
+        return points.new_ones(0)
     parts = zip(points.split(_AT_ONCE), normals.split(_AT_ONCE), strict=True)
-    return torch.cat([_share(p, n, places, facing, areas) for p, n in parts]) if len(points) else points.new_zeros(0)
+    return torch.cat([_share(p, n, discs, dark) for p, n in parts])
 
 
-def _share(points: Tensor, normals: Tensor, places: Tensor, facing: Tensor, areas: Tensor) -> Tensor:
+def _share(points: Tensor, normals: Tensor, discs: Discs, dark: Tensor | None) -> Tensor:
     # Squares and products by matrix multiplication: a few [R,D] arrays, which stay in the cache.
+    places, facing, areas = discs
     square = torch.cdist(points, places).square_().clamp_(min=1e-8)
     inverse = square.rsqrt()
     at_point = (normals @ places.T - (normals * points).sum(1, keepdim=True)).mul_(inverse).clamp_(min=0)
     at_disc = ((facing * places).sum(1) - points @ facing.T).neg_().mul_(inverse).clamp_(min=0)
     covered = at_point.mul_(at_disc).mul_(areas).div_(square.mul_(torch.pi).add_(areas))
-    return (1 - covered.sum(1)).clamp(min=0)
+    taken = covered.sum(1) if dark is None else covered @ dark
+    return (1 - taken).clamp(min=0)
 
 
-def cast(
-    means: Tensor, axes: Tensor, eye: Tensor, discs: list[Points], relative: list[Tensor], strength: float = 1.0
-) -> Shadow:
+def cast(means: Tensor, axes: Tensor, eye: Tensor, discs: Discs, strength: float = 1.0) -> Shadow:
     """The shadow of avatars on a scene; light that they take by less than half a step of 8 bits is not counted.
 
     Args:
         means: [N,3] the scene's Gaussians.
         axes: [N,3] theirs (`short_axes`).
         eye: [3] from where they are seen, which tells front from back.
-        discs: One set an avatar.
-        relative: [J,4,4] an avatar: its joints' transforms in this frame.
+        discs: The avatars.
         strength: 1 for the share of light that is taken; less for a lighter shadow.
     """
-    posed = [points.posed(one) for points, one in zip(discs, relative, strict=True)]
-    places, facing = torch.cat([p for p, _ in posed]), torch.cat([n for _, n in posed])
-    areas = torch.cat([points.areas for points in discs])
-    low, high = places.amin(0) - REACH, places.amax(0) + REACH
+    low, high = discs.places.amin(0) - REACH, discs.places.amax(0) + REACH
     rows = torch.nonzero(((means > low) & (means < high)).all(1))[:, 0]
     near, normals = means[rows], axes[rows]
     normals = torch.where(((eye - near) * normals).sum(1, keepdim=True) < 0, -normals, normals)
-    light = 1 - strength * (1 - sky_share(near, normals, places, facing, areas))
+    light = 1 - strength * (1 - sky_share(near, normals, discs))
     dark = light < 1 - _LEAST_TAKEN
     return Shadow(rows[dark], light[dark])
 
@@ -182,8 +200,8 @@ def _window(content: Content) -> Window | None:
         some = some[torch.arange(0, len(some), 6)]
         discs.append(Points(some.means, some.normals, 6 * some.areas, some.lbs_weights))
         relative.append(puppet.relative(puppet.motion.pose[[frame]], puppet.motion.transl[[frame]])[0])
-    axes = short_axes(gaussians)[rows]
-    shadow = cast(gaussians.means[rows], axes, cameras.centers[0], discs, relative)
+    axes = short_axes(gaussians.quats[rows], gaussians.scales[rows])
+    shadow = cast(gaussians.means[rows], axes, cameras.centers[0], carried(discs, relative))
     return hull(content.scene_boxes[rows][shadow.rows])
 
 

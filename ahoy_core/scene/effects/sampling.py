@@ -162,8 +162,13 @@ def _judge_lens(content: Content) -> Verdict:
     return Verdict(True, f"out of focus by up to {pixels:.1f} pixels", evidence, count)
 
 
+def mapping(content: Content, rates: Rates) -> float:
+    """CPU-seconds of finding the Gaussians of all full avatars for one pose."""
+    return rates.map * sum(puppet.avatar.map_work(puppet.body) for puppet in content.puppets)
+
+
 def posing(content: Content, rates: Rates) -> float:
-    """CPU-seconds of posing all avatars once."""
+    """CPU-seconds of posing all avatars once, their Gaussians found."""
     return len(content.puppets) * rates.skin + content.avatar_gaussians * rates.pose
 
 
