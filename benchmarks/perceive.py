@@ -150,7 +150,7 @@ def _texel_error(capture: Capture, body: PackagedBody, found: Perception) -> flo
     names = ("pose", "transl", "betas", "expression", "joint_confidence", "frame_confidence", "used", "viewmat", "K")
     fit = {name: getattr(found, name) for name in names}
     texture = build_texture(capture.frames, found.visible, fit, body, TextureConfig())
-    return colour_scores(capture, body, true_fit(capture, body), texture)["colour_error"]
+    return colour_scores(capture, body, true_fit(capture, body), texture)["texel_l1"]
 
 
 def _visible(truth: NDArray[np.floating], K: NDArray[np.floating], seen: NDArray[np.bool_]) -> NDArray[np.bool_]:

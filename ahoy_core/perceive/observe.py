@@ -15,6 +15,8 @@ from ahoy_core.perceive.residuals import Observations
 
 # Metres: spreads of a corrected landmark that count in full; wider ones count by the square of the ratio.
 BEST_IMAGE, BEST_WORLD = 0.02, 0.03
+# Of a corrected place in the picture: its spreads were learned on few people, and others are off by more than they say.
+IMAGE_TRUST = 0.3
 
 
 def observations(
@@ -43,7 +45,7 @@ def observations(
             torch.from_numpy(best / np.maximum(spread, best)) ** 2
             for best, spread in ((BEST_IMAGE, better.image_spread), (BEST_WORLD, better.world_spread))
         )
-        weights = torch.maximum(visible, trust)
+        weights = torch.maximum(visible, IMAGE_TRUST * trust)
     return Observations(
         points=torch.from_numpy(points.astype(np.float64)),
         weights=weights,

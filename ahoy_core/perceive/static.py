@@ -2,7 +2,9 @@
 
 The networks' masks spill over furniture in front of a person, here in one frame, there in another, while those pixels
 never change. So wherever a pixel shows its usual colour, its mask is held at or below a low quantile of the values it
-got when it looked like that. With a moving camera few pixels keep a usual colour, and nothing happens.
+got when it looked like that. Where the mask always spills over the same edge, the furniture itself tells: a patch that
+never changes, has no edge inside and lies mostly outside of all masks is no person anywhere. People's outlines move, so
+such a patch ends at them. With a moving camera few pixels keep a usual colour, and nothing happens.
 """
 
 from __future__ import annotations
@@ -16,6 +18,13 @@ MAX_SAMPLES = 48  # frames that the statistics are taken from
 SAME_COLOUR = 4.0  # of 255, after smoothing: what noise and compression leave
 SMOOTHING = 1.5  # pixels
 QUANTILE = 0.1
+STILL = 0.95  # share of the frames in which scenery looks as usual: people pass before it
+EDGE = 10.0  # of 255 a pixel: a patch ends at a steeper step of the usual picture
+OUTSIDE = 64  # of 255: masks held below it hold no person
+MOVED = 0.5  # largest share of the person that may look as usual all the time
+MOSTLY = 0.5  # share of a patch that has to be outside
+RIM = 3  # pixels: as far out a patch may reach beyond where it was found
+ALIKE = 20.0  # of 255, between a patch and its rim
 
 
 def hold_static(frames: NDArray[np.uint8], masks: NDArray[np.uint8], shots: NDArray[np.integer]) -> NDArray[np.uint8]:
@@ -36,11 +45,48 @@ def hold_static(frames: NDArray[np.uint8], masks: NDArray[np.uint8], shots: NDAr
             continue
         samples = inside[np.unique(np.linspace(0, len(inside) - 1, MAX_SAMPLES).round().astype(int))]
         usual = np.median(frames[samples], axis=0).astype(np.float32)
-        ceiling = _ceiling(frames[samples], masks[samples], usual)
+        same = np.stack([_looks_usual(frame, usual) for frame in frames[samples]])
+        ceiling = _ceiling(same, masks[samples])
+        found = scenery(usual, same.mean(axis=0) >= STILL, ceiling < OUTSIDE)
+        ceiling[found] = 0
+        rim = _rim(usual, found)
         for t in inside:
-            same = _looks_usual(frames[t], usual)
-            held[t][same] = np.minimum(masks[t], ceiling)[same]
+            usually = _looks_usual(frames[t], usual)
+            held[t][usually] = np.minimum(masks[t], ceiling)[usually]
+            # Smoothing mixes what moves into the last pixels of what does not: there each pixel is judged alone.
+            held[t][rim & (np.abs(frames[t] - usual).max(axis=-1) < 2 * SAME_COLOUR)] = 0
     return held
+
+
+def scenery(usual: NDArray[np.float32], still: NDArray[np.bool_], outside: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Pixels of patches that never change and lie mostly outside of the person.
+
+    Args:
+        usual: [H,W,3] what each pixel usually looks like, 0 to 255.
+        still: [H,W] where that hardly changes.
+        outside: [H,W] where they are not taken for the person.
+
+    Returns:
+        [H,W]; nothing where the person hardly moves, as their outline would not stop a patch.
+    """
+    person = still[~outside]
+    if not len(person) or person.mean() > MOVED:
+        return np.zeros_like(still)
+    smooth = cv2.GaussianBlur(usual, (0, 0), 1.0)
+    steps = [cv2.Sobel(smooth, cv2.CV_32F, *axes, ksize=3, scale=1 / 8) for axes in ((1, 0), (0, 1))]
+    flat = still & (np.hypot(*steps).max(axis=-1) < EDGE)
+    count, patch = cv2.connectedComponents(flat.astype(np.uint8), connectivity=4)
+    size, away = (np.bincount(patch[part], minlength=count) for part in (flat, flat & outside))
+    found = (size > 0) & (away >= MOSTLY * size)
+    found[0] = False
+    return np.asarray(found[patch])
+
+
+def _rim(usual: NDArray[np.float32], found: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Pixels [H,W] round patches that usually have a patch's colour."""
+    weight = cv2.blur(found.astype(np.float32), (2 * RIM + 1, 2 * RIM + 1))
+    color = cv2.blur(usual * found[..., None], (2 * RIM + 1, 2 * RIM + 1)) / np.maximum(weight, 1e-6)[..., None]
+    return np.asarray(~found & (weight > 1e-6) & (np.abs(usual - color).max(axis=-1) < ALIKE))
 
 
 def _looks_usual(frame: NDArray[np.uint8], usual: NDArray[np.float32]) -> NDArray[np.bool_]:
@@ -48,9 +94,8 @@ def _looks_usual(frame: NDArray[np.uint8], usual: NDArray[np.float32]) -> NDArra
     return np.asarray(np.abs(difference).max(axis=-1) < SAME_COLOUR)
 
 
-def _ceiling(frames: NDArray[np.uint8], masks: NDArray[np.uint8], usual: NDArray[np.float32]) -> NDArray[np.uint8]:
+def _ceiling(same: NDArray[np.bool_], masks: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Low quantile [H,W] of the masks over the frames in which the pixel looks as usual; 255 where it rarely does."""
-    same = np.stack([_looks_usual(frame, usual) for frame in frames])
     # Frames that look different sort to the end, so the quantile is a row of the sorted stack.
     ordered = np.sort(np.where(same, masks, np.uint8(255)), axis=0)
     count = same.sum(axis=0)

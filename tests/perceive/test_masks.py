@@ -114,3 +114,41 @@ def test_a_person_who_never_moves_keeps_their_mask_and_a_short_clip_is_left_alon
     np.testing.assert_array_equal(hold_static(frames, masks, np.zeros(10, int)), masks)
     masks[2] = 0
     np.testing.assert_array_equal(hold_static(frames[:4], masks[:4], np.zeros(4, int)), masks[:4])
+
+
+def desk_scene(moving: bool, frames: int = 16) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A striped person behind a plain desk, whose mask always spills 6 pixels over it: frames, masks, the truth."""
+    draw = np.random.default_rng(0)
+    clip = np.full((frames, 60, 60, 3), 150, np.uint8)
+    masks, truth = np.zeros((frames, 60, 60), np.uint8), np.zeros((frames, 60, 60), np.uint8)
+    stripes = draw.integers(0, 120, (60, 20, 3), np.uint8)
+    for t in range(frames):
+        left = 20 + (round(4 * np.sin(t)) if moving else 0)
+        clip[t, 10:, left : left + 20] = stripes[10:]
+        clip[t, 40:] = (60, 64, 70)
+        masks[t, 10:46, left : left + 20] = 255
+        truth[t, 10:40, left : left + 20] = 255
+    noisy = clip.astype(int) + draw.integers(-2, 3, clip.shape)
+    return np.clip(noisy, 0, 255).astype(np.uint8), masks, truth
+
+
+def test_a_mask_that_always_spills_over_a_desk_ends_at_the_desk() -> None:
+    frames, masks, truth = desk_scene(moving=True)
+    held = hold_static(frames, masks, np.zeros(len(frames), int))
+    assert held[:, 41:].max() == 0
+    # The row at the desk's edge is half of either.
+    assert float((held[:, :39] == truth[:, :39]).mean()) > 0.995
+    before = float((masks == truth).mean())
+    assert before < 0.97
+
+
+def test_a_person_who_stands_still_behind_a_desk_is_left_whole() -> None:
+    frames, masks, _ = desk_scene(moving=False)
+    np.testing.assert_array_equal(hold_static(frames, masks, np.zeros(len(frames), int)), masks)
+
+
+def test_a_desk_that_is_mostly_taken_for_the_person_is_not_called_scenery() -> None:
+    frames, masks, _ = desk_scene(moving=True)
+    masks[:, 40:] = 255
+    held = hold_static(frames, masks, np.zeros(len(frames), int))
+    assert held[:, 44:].min() == 255
