@@ -16,6 +16,8 @@ GUIDE_CELLS = 2  # how far an edge may move to meet an edge of the picture: the 
 GUIDE_EPS = 1e-3  # colour variance (RGB in [0,1]) below which a patch counts as flat
 SOFT_LOW, SOFT_HIGH = 0.2, 0.85  # mask values that become 0 and 1: the network's edge is wider than the picture's
 EDGE = 0.5 * (SOFT_LOW + SOFT_HIGH) * 255  # of 255: the soft mask's value where the alpha is a half
+CLOTHES = 0.006  # of the body's height: a centimetre that clothes stand off an adult
+SEEN_EDGE = 0.015  # of the body's height: so near to what is visible, the visible edge is the person's own
 REACH = 0.12  # of the body's height: what lies farther from the fitted body is not this person
 SUPERSAMPLING = 2
 MIN_DEPTH = 1e-3  # metres: nearer points count as behind the camera
@@ -51,7 +53,7 @@ def frame_masks(soft: NDArray[np.uint8], silhouette: NDArray[np.uint8]) -> Frame
     visible = np.round(alpha * 255).astype(np.uint8)
     body, seen = silhouette > VISIBLE, visible > VISIBLE
     occluded = 1.0 - float((body & seen).sum()) / max(int(body.sum()), 1) if body.any() else 0.0
-    return FrameMasks(visible, np.maximum(silhouette, visible), mask_box(visible), occluded)
+    return FrameMasks(visible, np.maximum(clothed(silhouette, visible), visible), mask_box(visible), occluded)
 
 
 def refine(frame: NDArray[np.uint8], soft: NDArray[np.float32], crop_size: float) -> NDArray[np.uint8]:
@@ -76,10 +78,27 @@ def refine(frame: NDArray[np.uint8], soft: NDArray[np.float32], crop_size: float
     return result
 
 
+def clothed(body: NDArray[np.uint8], visible: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """A naked silhouette [H,W] widened by what clothes take, where nothing visible shows how wide it is."""
+    height = _extent(body)
+    if height <= 0:
+        return body
+    beside, unseen = (
+        cv2.distanceTransform((mask <= VISIBLE).astype(np.uint8), cv2.DIST_L2, 5) for mask in (body, visible)
+    )
+    wider = 255 * np.clip(CLOTHES * height + 0.5 - beside, 0.0, 1.0)
+    return np.where(unseen > SEEN_EDGE * height, np.maximum(body, np.round(wider)), body).astype(np.uint8)
+
+
+def _extent(mask: NDArray[np.uint8]) -> float:
+    """Pixels across a mask's box, the longer way; 0 if it is empty."""
+    box = mask_box(mask)
+    return float(max(box[3] - box[1], box[2] - box[0]))
+
+
 def near_body(amodal: NDArray[np.uint8]) -> NDArray[np.float32]:
     """1 on the body, falling to 0 at `REACH` of its height: clothes and hair are kept, other people are not. [H,W]."""
-    box = mask_box(amodal)
-    height = float(max(box[3] - box[1], box[2] - box[0]))
+    height = _extent(amodal)
     if height <= 0:
         return np.ones(amodal.shape, np.float32)
     away = cv2.distanceTransform((amodal <= VISIBLE).astype(np.uint8), cv2.DIST_L2, 3)

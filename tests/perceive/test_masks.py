@@ -152,3 +152,15 @@ def test_a_desk_that_is_mostly_taken_for_the_person_is_not_called_scenery() -> N
     masks[:, 40:] = 255
     held = hold_static(frames, masks, np.zeros(len(frames), int))
     assert held[:, 44:].min() == 255
+
+
+def test_hidden_parts_are_as_wide_as_clothes_and_visible_edges_stay() -> None:
+    body = np.zeros((300, 200), np.uint8)
+    body[20:280, 80:120] = 255
+    visible = np.where(np.arange(300)[:, None] < 150, body, 0).astype(np.uint8)
+    masks = frame_masks(visible, body)
+    np.testing.assert_array_equal(masks.amodal[:150], body[:150])
+    widths = (masks.amodal[160:270] > 127).sum(axis=1)
+    # 0.6% of 260 pixels are 1.56: one more pixel on either side is covered by half or more.
+    assert widths.min() == widths.max() == 40 + 2
+    assert frame_masks(visible, np.zeros_like(body)).amodal.max() == 255, "what is visible belongs to the person"
