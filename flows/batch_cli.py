@@ -81,13 +81,13 @@ def status(
 ) -> None:
     """Show how a batch stands, by the store alone: per stage and state, errors, time left, cost."""
     # Nothing else: importing the stages themselves would take ten seconds.
-    from storage_schema.artifacts import ARTIFACTS
+    from storage_schema.artifacts import RUN_STAGES
     from storage_schema.status import batch_status
     from storage_schema.tables import Tables
 
     with _errors():
         opened = _open(store)
-        tables, names = Tables(opened), list(ARTIFACTS)
+        tables, names = Tables(opened), RUN_STAGES
         now = batch_status(opened, tables, batch, names)
         if as_json:
             sys.stdout.write(json.dumps(now.to_json(records=True), indent=1) + "\n")

@@ -181,3 +181,7 @@ ARTIFACTS: Mapping[str, tuple[Blob, ...]] = {
         Blob("cell.json"),  # which picture is which, and what was left out
     ),
 }
+
+_BESIDE = ("withhold", "truth", "subjects", "evaluate")
+RUN_STAGES = tuple(stage for stage in ARTIFACTS if stage not in _BESIDE)
+"""Stages that every video of a batch goes through, in order; the others belong to other commands."""

@@ -65,7 +65,8 @@ class BatchStatus:
 
     Attributes:
         videos: state -> count, every state of `VIDEO_STATES` in it.
-        stages: stage -> state -> count of videos; a video that has not come to a stage counts as waiting.
+        stages: stage -> state -> count of videos; a video that has not come to a stage counts as waiting, unless
+            it failed or was cancelled before.
         errors: most frequent first.
         eta_s: seconds until the rest is done if as many videos go on side by side as now (`side_by_side`); None while a
             stage was never measured; 0 when nothing is left.
@@ -210,7 +211,14 @@ def _stage_names(stages: Sequence[str], rows: Mapping[str, Sequence[Row]]) -> li
 
 
 def _stage_counts(names: Sequence[str], records: Sequence[VideoStatus]) -> dict[str, dict[str, int]]:
-    return {name: dict(Counter(record.stages.get(name, "waiting") for record in records)) for name in names}
+    counts: dict[str, Counter[str]] = {name: Counter() for name in names}
+    for record in records:
+        later = None if record.state in ("failed", "cancelled") else "waiting"
+        for name in names:
+            state = record.stages.get(name, later)
+            if state is not None:
+                counts[name][state] += 1
+    return {name: dict(count) for name, count in counts.items()}
 
 
 def _cost_by_stage(names: Sequence[str], rows: Mapping[str, Sequence[Row]]) -> dict[str, Cost]:
