@@ -49,6 +49,7 @@ from ahoy_core.perceive.masks import silhouette
 from ahoy_core.texture.texture import Texture, build_texture
 from benchmarks.avatar_supervision import TESTED, inconsistent, true_faces, true_sequences
 from tasks.evaluation.scoring import AvatarScores, score_avatar
+from tasks.fills import Fills
 from tasks.presets import PRESETS
 from tasks.roles import perceptual_network
 from tasks.settings import Settings
@@ -94,9 +95,9 @@ def measure(subject: Subject, config: str, sheets: Path | None) -> dict[str, Any
     facts: dict[str, Any] = {}
     with Meter() as meter:
         if config == "coarse":
-            result = train_coarse(subject.inputs, subject.settings.coarse, info, perceptual=perceptual_network())
+            result = train_coarse(subject.inputs, subject.settings.coarse, info, perceptual=perceptual_network(Fills()))
         else:
-            made = train_full(subject.full_inputs(config), settings, info, perceptual=perceptual_network())
+            made = train_full(subject.full_inputs(config), settings, info, perceptual=perceptual_network(Fills()))
             result = made
             facts = {"corrections": {name: round(value, 3) for name, value in made.corrections.items()}}
     bill = meter.read()

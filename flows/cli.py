@@ -13,6 +13,7 @@ from rich.table import Table
 
 from flows import (
     batch_cli,
+    cost_cli,
     evaluate_cli,
     export_cli,
     models_cli,
@@ -34,7 +35,15 @@ app.add_typer(models_cli.app, name="models")
 app.add_typer(prior_cli.app, name="prior")
 app.add_typer(store_cli.app, name="store")
 COMMANDS = (
-    *(batch_cli.submit, batch_cli.status, batch_cli.rerun, batch_cli.cancel, batch_cli.logs, plan_cli.plan),
+    *(
+        batch_cli.submit,
+        batch_cli.status,
+        batch_cli.rerun,
+        batch_cli.cancel,
+        batch_cli.logs,
+        plan_cli.plan,
+        cost_cli.cost,
+    ),
     *(server_cli.server, server_cli.worker, server_cli.install),
     *(render_cli.render, export_cli.export, view_cli.view, evaluate_cli.evaluate),
 )

@@ -106,7 +106,7 @@ def _make(
     roles: dict[str, dict[str, Any]],
     started: datetime,
 ) -> Manifest:
-    manifests, folders = _resolve(stage, inputs, run.store)
+    manifests, folders = resolve_inputs(stage, inputs, run.store)
     meter = Meter()
     try:
         with run.store.attempt(key, stage.name) as attempt, meter:
@@ -143,9 +143,14 @@ def _make(
     return manifest
 
 
-def _resolve(
+def resolve_inputs(
     stage: Stage, inputs: Mapping[str, StageRef | Source], store: ArtifactStore
 ) -> tuple[dict[str, Manifest], dict[str, Path]]:
+    """Manifests and folders of a stage's inputs.
+
+    Raises:
+        FileNotFoundError: an artifact is not whole in the store.
+    """
     manifests: dict[str, Manifest] = {}
     folders: dict[str, Path] = {}
     for name, value in inputs.items():

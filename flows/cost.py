@@ -1,0 +1,228 @@
+"""The sweeps of `ahoy cost`: every stage on inputs out of the store, and whole runs from the video to the report.
+
+A row that was measured is not measured again: it is found by the hash of all it depends on. What fails is a row too,
+and one of the omissions.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+from ahoy_core.captures import Capture
+from ahoy_core.cost.sweep import Measurement, Spread, sweep
+from ahoy_core.cost.work import FRAMES, KNOBS, PIXELS
+from ahoy_core.formats.npz import load_npz
+from flows.evaluate import Subject, score, stages_up_to
+from flows.evaluate_request import EvaluateRequest
+from flows.pipeline import call_directly, process
+from storage_schema.store import ArtifactStore
+from tasks.cost.declared import StageSweep
+from tasks.cost.errors import rmse
+from tasks.cost.rows import Rows
+from tasks.cost.truth import TruthConfig, truth_stage
+from tasks.evaluation.cell import avatar_renderer
+from tasks.evaluation.results import Cell, read_rows
+from tasks.running import resolve_inputs, run_stage
+from tasks.settings import Settings
+from tasks.stage import Observer, Run, Source, Stage, StageContext, StageRef
+from tasks.stages import STAGES
+
+Told = Callable[[str], None]
+PROTOCOLS = ("novel-view-gt", "novel-pose-gt")
+END = STAGES[-1].name
+
+
+@dataclass(frozen=True)
+class Base:
+    """A capture with the settings that knobs are changed around.
+
+    Attributes:
+        request: the evaluation that a whole run is scored by; its preset and overrides are the base settings.
+        capture: of its data set.
+        store: where inputs and whole runs are kept.
+        observer: who watches the stages.
+    """
+
+    request: EvaluateRequest
+    capture: Capture
+    store: ArtifactStore
+    observer: Observer
+
+    @property
+    def subject(self) -> Subject:
+        """As the evaluation sees it."""
+        return Subject(self.request, self.capture, self.store, self.observer)
+
+
+def stage_rows(
+    base: Base, declared: StageSweep, values: Mapping[str, Sequence[Any]], repeats: int, rows: Rows, told: Told
+) -> None:
+    """Sweep the knobs of one stage on one capture, and keep each row as it is measured.
+
+    Args:
+        base: capture and base settings.
+        declared: how the stage is swept.
+        values: knob -> values.
+        repeats: runs of every setting.
+        rows: where they are kept; those that are there are not measured again.
+        told: called with a line on each knob.
+    """
+    stage, subject = declared.stage, base.subject
+    run = subject.run()
+    inputs = _inputs(base, declared, run)
+    manifests, folders = resolve_inputs(stage, inputs, base.store)
+    config = getattr(subject.settings("full"), stage.name)
+    with tempfile.TemporaryDirectory() as scratch:
+        numbers = count()
+
+        def make(setting: Mapping[str, Any]) -> Path:
+            chosen = {**config.model_dump(), **declared.knows(base.capture), **setting}
+            out = Path(scratch) / str(next(numbers))
+            out.mkdir()
+            ctx = StageContext(
+                folders, manifests, out, lambda done, total, note="": None, run.body, prior=run.prior, fills=run.fills
+            )
+            settings = type(config).model_validate(chosen)
+            declared.forget(settings, ctx)
+            stage.run(settings, ctx)
+            return out
+
+        def row_hash(setting: Mapping[str, Any]) -> str:
+            told_of = {name: str(value) for name, value in declared.knows(base.capture).items()}
+            made_by = {name: ref.content_hash for name, ref in inputs.items()}
+            return _hash(
+                [stage.name, stage.version, repeats, {**config.model_dump(mode="json"), **told_of, **setting}, made_by]
+            )
+
+        warmed = False
+        for knob, choices in values.items():
+            name = f"{stage.name}.{knob}"
+            hashes = {row_hash({knob: value}): {knob: value} for value in choices}
+            left = {made_of: setting for made_of, setting in hashes.items() if not rows.reuse(made_of, name, setting)}
+            told(f"{base.capture.name}, {name}: {len(left)} of {len(hashes)} to measure")
+            if left and not warmed:
+                make(declared.warm_up)
+                warmed = True
+            found = sweep(
+                name,
+                left.values(),
+                make,
+                lambda made: declared.errors(base.capture, folders, made),
+                repeats=repeats,
+                warm=False,
+            )
+            given = _clip(folders["ingest"])
+            for made_of, row in zip(left, found, strict=True):
+                knobs = {**work_knobs(subject.settings("full"), given), **_named(stage.name, row.setting)}
+                rows.add(replace(row, capture=base.capture.name, knobs=knobs, made_of=made_of))
+
+
+def _inputs(base: Base, declared: StageSweep, run: Run) -> dict[str, StageRef]:
+    """What the stage is given: found in the store or made, on true bodies where the declaration says so."""
+    subject = base.subject
+
+    def call(stage: Stage, settings: Settings, inputs: Mapping[str, StageRef | Source], run: Run) -> StageRef:
+        if stage.name == "perceive" and declared.true_bodies:
+            named = {"capture": subject.truth, "ingest": inputs["ingest"]}
+            return run_stage(truth_stage(base.capture), TruthConfig(), named, run)
+        return call_directly(stage, settings, inputs, run)
+
+    needs = declared.stage.needs
+    made = process(subject.video, subject.settings("full"), run, only=needs, call=call)
+    return {name: made.refs[name] for name in needs}
+
+
+def whole_rows(base: Base, settings: Mapping[str, EvaluateRequest], rows: Rows, told: Told) -> None:
+    """Whole runs on one capture, each scored against the truth.
+
+    A run's seconds are the bills of its stages, those that another run of this sweep left in the store too.
+
+    Args:
+        base: the capture.
+        settings: by what is said of the row (`preset=draft`, `avatar.steps=60`), the request that it stands for.
+        rows: where rows are kept.
+        told: called with a line on each run.
+    """
+    for said, request in settings.items():
+        subject = replace(base, request=request).subject
+        chosen = subject.settings("full")
+        versions = {stage.name: stage.version for stage in STAGES}
+        made_of = _hash([chosen.model_dump(mode="json"), versions, subject.truth.content_hash, request.size])
+        knob, _, value = said.partition("=")
+        if rows.reuse(made_of, f"end-to-end.{knob}", {knob: _plain(value)}):
+            continue
+        told(f"{base.capture.name}, end to end: {said}")
+        row = Measurement(f"end-to-end.{knob}", {knob: _plain(value)}, capture=base.capture.name, made_of=made_of)
+        try:
+            rows.add(_whole(row, subject))
+        except Exception as problem:  # a run that fails is a finding about that setting
+            rows.add(replace(row, failed=f"{type(problem).__name__}: {problem}"))
+
+
+def _whole(row: Measurement, subject: Subject) -> Measurement:
+    run = subject.run()
+    outcome, perceived = stages_up_to(subject, "full", END, run)
+    ref = score(subject, "full", outcome, perceived, ("avatar",), avatar_renderer)
+    scored = read_rows(subject.store, [Cell(subject.capture.name, "full", ref)])
+    bills = [ref.bill for ref in outcome.refs.values()]
+    parts: dict[str, float] = {}
+    for ref in outcome.refs.values():
+        parts[ref.stage] = parts.get(ref.stage, 0.0) + ref.bill.cpu_s
+    errors = {
+        name: rmse(_mean([one["psnr"] for one in scored if one["protocol"] in kept and one["region"] == region]))
+        for name, kept, region in (
+            ("rmse", PROTOCOLS, "box"),
+            ("view_rmse", PROTOCOLS[:1], "box"),
+            ("pose_rmse", PROTOCOLS[1:], "box"),
+            ("head_rmse", PROTOCOLS[:1], "head"),
+        )
+    }
+    ingest = subject.store.lookup(outcome.refs["ingest"].key, stage="ingest", verify=False)
+    assert ingest is not None
+    return replace(
+        row,
+        errors=errors,
+        wall_s=Spread.of([sum(bill.wall_s for bill in bills)]),
+        cpu_s=Spread.of([sum(bill.cpu_s for bill in bills)]),
+        peak_mb=Spread.of([max(bill.peak_rss_mb for bill in bills)]),
+        knobs=work_knobs(subject.settings("full"), _clip(subject.store.fetch(ingest))),
+        parts=parts,
+    )
+
+
+def work_knobs(settings: Settings, clip: Mapping[str, int]) -> dict[str, Any]:
+    """What decides the work of every stage, by name."""
+    values = settings.model_dump(mode="json")
+    named = {name: values[name.partition(".")[0]][name.partition(".")[2]] for name in KNOBS if name not in clip}
+    return {**clip, **named}
+
+
+def _named(stage: str, setting: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: value for knob, value in setting.items() if (name := f"{stage}.{knob}") in KNOBS}
+
+
+def _clip(ingest: Path) -> dict[str, int]:
+    shape = load_npz(ingest / "frames.npz", ["frames"])["frames"].shape
+    return {FRAMES: int(shape[0]), PIXELS: int(shape[1] * shape[2])}
+
+
+def _mean(values: Sequence[float]) -> float:
+    return sum(values) / len(values) if values else float("nan")
+
+
+def _plain(text: str) -> Any:
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError:
+        return text
+
+
+def _hash(value: Any) -> str:
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:16]
