@@ -70,7 +70,12 @@ def main(verbose: Annotated[bool, typer.Option("--verbose", "-v", help="log what
 def run(
     video: Annotated[str, typer.Argument(help="a video: a path or an address")],
     out: Annotated[Path, typer.Option(help="folder for the avatar, the videos and the report")],
-    preset: Annotated[str, typer.Option(help="draft, standard or high: how much time to spend")] = "standard",
+    preset: Annotated[
+        str | None, typer.Option(help="draft, standard or high: how much time to spend  [default: standard]")
+    ] = None,
+    budget: Annotated[
+        str | None, typer.Option(help="time to spend, such as 90s or 3m: the knobs that buy the most in it")
+    ] = None,
     subject: Annotated[
         str | None, typer.Option(help="which person, 0 for the most visible, or all: one avatar each")
     ] = None,
@@ -107,12 +112,14 @@ def run(
                     "video": video,
                     "out": str(out),
                     "store": store,
-                    "preset": preset,
+                    "preset": preset or "standard",
                     "subject": int(subject) if subject and subject.isdigit() else subject,
                     "stages": tuple(stages.split(",")) if stages else None,
                     "overrides": tuple(set_ or ()),
                 }
             )
+            if budget is not None:
+                request = _within(request, budget, preset, console)
             if list_subjects:
                 paths = _list_here(request, console)
             else:
@@ -122,6 +129,19 @@ def run(
         raise typer.Exit(EXIT_INTERRUPTED) from None
     for name, path in paths.items():
         console.print(f"{name:<20} {path}", soft_wrap=True, highlight=False)
+
+
+def _within(request: VideoRequest, budget: str, preset: str | None, console: Console) -> VideoRequest:
+    """The request with the knobs that a budget buys."""
+    from flows.budget import budgeted
+    from flows.duration import seconds_of
+
+    if preset is not None:
+        raise ValueError(f"expected --preset or --budget, got both ({preset}, {budget}): a budget chooses the knobs")
+    chosen = budgeted(request, seconds_of(budget, "3m"))
+    for line in chosen.said:
+        console.print(line, soft_wrap=True, highlight=False)
+    return request.model_copy(update={"preset": chosen.preset, "overrides": chosen.overrides})
 
 
 def _run_here(request: VideoRequest, console: Console) -> dict[str, Path]:

@@ -25,6 +25,7 @@ from flows.pipeline import call_directly, process
 from storage_schema.store import ArtifactStore
 from tasks.cost.declared import StageSweep
 from tasks.cost.errors import rmse
+from tasks.cost.predict import work_knobs
 from tasks.cost.rows import Rows
 from tasks.cost.truth import TruthConfig, truth_stage
 from tasks.evaluation.cell import avatar_renderer
@@ -195,13 +196,6 @@ def _whole(row: Measurement, subject: Subject) -> Measurement:
         knobs=work_knobs(subject.settings("full"), _clip(subject.store.fetch(ingest))),
         parts=parts,
     )
-
-
-def work_knobs(settings: Settings, clip: Mapping[str, int]) -> dict[str, Any]:
-    """What decides the work of every stage, by name."""
-    values = settings.model_dump(mode="json")
-    named = {name: values[name.partition(".")[0]][name.partition(".")[2]] for name in KNOBS if name not in clip}
-    return {**clip, **named}
 
 
 def _named(stage: str, setting: Mapping[str, Any]) -> dict[str, Any]:

@@ -16,6 +16,8 @@ from ahoy_core.cost.work import Knobs, TimeModel, fit_times
 from tasks.cost.declared import END_TO_END
 from tasks.cost.errors import psnr
 from tasks.cost.summary import of_sweep, over_captures
+from tasks.presets import PRESETS
+from tasks.settings import Preset
 
 ASSET = "cost.json"
 VERSION = 1
@@ -35,7 +37,7 @@ class MeasuredSet:
     rows: tuple[Measurement, ...]
     unit_cpu_s: float
     machine: Mapping[str, Any]
-    preset: str
+    preset: Preset
     overrides: tuple[str, ...]
 
     @cached_property
@@ -99,7 +101,10 @@ def read_measured(text: str) -> MeasuredSet:
         )
     rows = tuple(row_of(row) for row in said["rows"])
     base = said["base"]
-    return MeasuredSet(rows, float(said["unit_cpu_s"]), said["machine"], base["preset"], tuple(base["overrides"]))
+    preset = next((name for name in PRESETS if name == base["preset"]), None)
+    if preset is None:
+        raise ValueError(f"expected a measured set round a preset of {', '.join(PRESETS)}, got {base['preset']!r}")
+    return MeasuredSet(rows, float(said["unit_cpu_s"]), said["machine"], preset, tuple(base["overrides"]))
 
 
 @cache

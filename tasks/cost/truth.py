@@ -59,10 +59,10 @@ def write_truth(capture: Capture, body: PackagedBody, video: dict[str, np.ndarra
     visible = clip.visible[index]
     hits = [_body_hits(body, fit, t, width, height) for t in range(len(index))]
     regions = set(body.regions["head"].tolist())
-    on_head = np.isin(body.faces.numpy(), list(regions)).all(1)
+    on_head = np.asarray(np.isin(body.faces.numpy(), list(regions)).all(axis=1))
     amodal = np.stack([hit >= 0 for hit in hits])
     head = np.stack([(hit >= 0) & on_head[hit] for hit in hits])
-    seen = np.asarray(visible > 127)
+    seen = visible > 127
     masks = {
         "visible": visible,
         "amodal": np.where(amodal, np.uint8(255), np.uint8(0)),
