@@ -56,6 +56,11 @@ def budgeted(request: VideoRequest, budget_s: float, measured: MeasuredSet | Non
         ValueError: there is no measured set to choose from.
     """
     measured = measured or packaged_set()
+    if not measured.gains():
+        raise ValueError(
+            "expected whole runs in the measured set, got none: `ahoy cost end-to-end --measured FILE` measures them; "
+            "until then choose a preset"
+        )
     source = request.source()
     folder = Path(request.out) / request.id_of(source) if request.out else None
     asked = {"budget_s": budget_s, "fixed": list(request.overrides), "unit_cpu_s": measured.unit_cpu_s}

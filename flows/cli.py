@@ -20,6 +20,7 @@ from flows import (
     plan_cli,
     prior_cli,
     render_cli,
+    replay_cli,
     server_cli,
     store_cli,
     view_cli,
@@ -35,15 +36,8 @@ app.add_typer(models_cli.app, name="models")
 app.add_typer(prior_cli.app, name="prior")
 app.add_typer(store_cli.app, name="store")
 COMMANDS = (
-    *(
-        batch_cli.submit,
-        batch_cli.status,
-        batch_cli.rerun,
-        batch_cli.cancel,
-        batch_cli.logs,
-        plan_cli.plan,
-        cost_cli.cost,
-    ),
+    *(batch_cli.submit, batch_cli.status, batch_cli.rerun, batch_cli.cancel, batch_cli.logs),
+    *(plan_cli.plan, cost_cli.cost, replay_cli.replay),
     *(server_cli.server, server_cli.worker, server_cli.install),
     *(render_cli.render, export_cli.export, view_cli.view, evaluate_cli.evaluate),
 )

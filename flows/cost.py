@@ -15,28 +15,26 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
+from ahoy_core.avatar.files import load_avatar
 from ahoy_core.captures import Capture
 from ahoy_core.cost.sweep import Measurement, Spread, sweep
 from ahoy_core.cost.work import FRAMES, KNOBS, PIXELS
 from ahoy_core.formats.npz import load_npz
-from flows.evaluate import Subject, score, stages_up_to
+from flows.evaluate import Subject, stages_up_to
 from flows.evaluate_request import EvaluateRequest
 from flows.pipeline import call_directly, process
 from storage_schema.store import ArtifactStore
 from tasks.cost.declared import StageSweep
-from tasks.cost.errors import rmse
+from tasks.cost.errors import whole_errors
 from tasks.cost.predict import work_knobs
 from tasks.cost.rows import Rows
 from tasks.cost.truth import TruthConfig, truth_stage
-from tasks.evaluation.cell import avatar_renderer
-from tasks.evaluation.results import Cell, read_rows
 from tasks.running import resolve_inputs, run_stage
 from tasks.settings import Settings
 from tasks.stage import Observer, Run, Source, Stage, StageContext, StageRef
 from tasks.stages import STAGES
 
 Told = Callable[[str], None]
-PROTOCOLS = ("novel-view-gt", "novel-pose-gt")
 END = STAGES[-1].name
 
 
@@ -168,34 +166,27 @@ def whole_rows(base: Base, settings: Mapping[str, EvaluateRequest], rows: Rows, 
 
 
 def _whole(row: Measurement, subject: Subject) -> Measurement:
-    run = subject.run()
-    outcome, perceived = stages_up_to(subject, "full", END, run)
-    ref = score(subject, "full", outcome, perceived, ("avatar",), avatar_renderer)
-    scored = read_rows(subject.store, [Cell(subject.capture.name, "full", ref)])
+    outcome, _ = stages_up_to(subject, "full", END, subject.run())
+    folders = {name: _folder(subject.store, outcome.refs[name]) for name in ("ingest", "avatar")}
     bills = [ref.bill for ref in outcome.refs.values()]
     parts: dict[str, float] = {}
     for ref in outcome.refs.values():
         parts[ref.stage] = parts.get(ref.stage, 0.0) + ref.bill.cpu_s
-    errors = {
-        name: rmse(_mean([one["psnr"] for one in scored if one["protocol"] in kept and one["region"] == region]))
-        for name, kept, region in (
-            ("rmse", PROTOCOLS, "box"),
-            ("view_rmse", PROTOCOLS[:1], "box"),
-            ("pose_rmse", PROTOCOLS[1:], "box"),
-            ("head_rmse", PROTOCOLS[:1], "head"),
-        )
-    }
-    ingest = subject.store.lookup(outcome.refs["ingest"].key, stage="ingest", verify=False)
-    assert ingest is not None
     return replace(
         row,
-        errors=errors,
+        errors=whole_errors(load_avatar(folders["avatar"]), subject.capture, subject.request.size),
         wall_s=Spread.of([sum(bill.wall_s for bill in bills)]),
         cpu_s=Spread.of([sum(bill.cpu_s for bill in bills)]),
         peak_mb=Spread.of([max(bill.peak_rss_mb for bill in bills)]),
-        knobs=work_knobs(subject.settings("full"), _clip(subject.store.fetch(ingest))),
+        knobs=work_knobs(subject.settings("full"), _clip(folders["ingest"])),
         parts=parts,
     )
+
+
+def _folder(store: ArtifactStore, ref: StageRef) -> Path:
+    manifest = store.lookup(ref.key, stage=ref.stage, verify=False)
+    assert manifest is not None  # it was made or found a moment ago
+    return store.fetch(manifest)
 
 
 def _named(stage: str, setting: Mapping[str, Any]) -> dict[str, Any]:
@@ -205,10 +196,6 @@ def _named(stage: str, setting: Mapping[str, Any]) -> dict[str, Any]:
 def _clip(ingest: Path) -> dict[str, int]:
     shape = load_npz(ingest / "frames.npz", ["frames"])["frames"].shape
     return {FRAMES: int(shape[0]), PIXELS: int(shape[1] * shape[2])}
-
-
-def _mean(values: Sequence[float]) -> float:
-    return sum(values) / len(values) if values else float("nan")
 
 
 def _plain(text: str) -> Any:

@@ -102,14 +102,14 @@ def _measure(
     rows: Rows,
     observer: Observer,
 ) -> None:
-    from flows.cost import PROTOCOLS, Base, stage_rows, whole_rows
+    from flows.cost import Base, stage_rows, whole_rows
     from flows.evaluate_request import EvaluateRequest
     from tasks.cost.declared import END_TO_END, STAGE_SWEEPS
 
     def told(line: str) -> None:
         console.print(escape(line), highlight=False, soft_wrap=True)
 
-    request = EvaluateRequest.model_validate({**fields, "protocols": PROTOCOLS, "ablate": ("full",)})
+    request = EvaluateRequest.model_validate({**fields, "ablate": ("full",)})
     artifacts = request.open_store()
     for capture in request.captures():
         base = Base(request, capture, artifacts, observer)

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from ahoy_core.cost.choose import Alternative, alternatives, worth_telling
-from ahoy_core.cost.pace import measure_pace
 from ahoy_core.cost.work import FRAMES, KNOBS, PIXELS, WORK
 from ahoy_core.formats.npz import load_npz
 from storage_schema.store import Manifest
@@ -20,7 +19,7 @@ _TOLD = 5
 
 @dataclass(frozen=True)
 class BillRow:
-    """One stage; `predicted_s` are CPU seconds on this machine, None where nothing was measured of it before."""
+    """One stage; `predicted_s` are CPU seconds on the set's machine, None where nothing was measured of it before."""
 
     stage: str
     wall_s: float
@@ -37,12 +36,14 @@ class RunBill:
         rows: a stage each.
         buys: single changes that would have gained accuracy, what gains most a second first.
         saves: single changes that would have saved time, what costs least accuracy first.
+        factor: CPU seconds here for one on the set's machine, over the stages that were predicted.
         measured_on: what gains and rates were measured on, in words.
     """
 
     rows: tuple[BillRow, ...]
     buys: tuple[Alternative, ...]
     saves: tuple[Alternative, ...]
+    factor: float
     measured_on: str
 
 
@@ -54,12 +55,13 @@ def run_bill(ctx: StageContext, measured: MeasuredSet) -> RunBill:
         measured: what is known of cost and gain.
     """
     knobs = known_knobs(ctx)
-    factor = measure_pace(1.0).cpu_s / measured.unit_cpu_s
-    predicted = {stage: factor * took for stage, took in _seconds(measured, knobs).items()}
+    predicted = _seconds(measured, knobs)
     rows = []
     for title, manifest in ctx.manifests.items():
         bill = manifest.summary["bill"]
         rows.append(BillRow(title, bill["wall_s"], bill["cpu_s"], bill["peak_rss_mb"], predicted.get(manifest.stage)))
+    told = [row for row in rows if row.predicted_s]
+    factor = sum(row.cpu_s for row in told) / max(sum(row.predicted_s or 0.0 for row in told), 1e-9) if told else 1.0
     gains = gains_of(measured)
     now = {knob: value for knob in gains.by_knob if (value := _value(ctx.manifests, knob)) is not None}
 
@@ -70,7 +72,7 @@ def run_bill(ctx: StageContext, measured: MeasuredSet) -> RunBill:
     buys, saves = worth_telling(found, LEAST_GAIN_DB, _TOLD)
     captures = ", ".join(sorted({row.capture for row in measured.rows}))
     where = f"captures {captures}, round preset {measured.preset}, on {measured.machine['cpu']}"
-    return RunBill(tuple(rows), tuple(buys), tuple(saves), where)
+    return RunBill(tuple(rows), tuple(buys), tuple(saves), factor, where)
 
 
 def known_knobs(ctx: StageContext) -> dict[str, Any]:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ahoy_core.avatar.avatar import Avatar
 from ahoy_core.avatar.files import load_avatar
 from ahoy_core.body.packaged import load_packaged_body
 from ahoy_core.captures.body_errors import body_errors
@@ -42,6 +43,21 @@ def rendered(capture: Capture, inputs: Mapping[str, Path], made: Path) -> Mappin
     """Root mean square error, of 255, before all true cameras at the input's moments: person's box and head's box."""
     scores = score_avatar(load_avatar(made), load_packaged_body(), capture, capture.of("view"))
     return {"rmse": rmse(scores.psnr), "head_rmse": rmse(scores.psnr_head), "iou_loss": 1 - scores.iou}
+
+
+def whole_errors(avatar: Avatar, capture: Capture, size: int) -> Mapping[str, float]:
+    """Root mean square errors, of 255, of an avatar driven by the true body, before cameras that are not the input's.
+
+    `rmse` stands for the mean PSNR of novel views and novel poses, which `view_rmse` and `pose_rmse` give apart.
+    """
+    views, poses = ([v for v in capture.of(m) if v.camera != capture.input_camera] for m in ("view", "pose"))
+    view, pose = (score_avatar(avatar, load_packaged_body(), capture, some, size) for some in (views, poses))
+    return {
+        "rmse": rmse((view.psnr + pose.psnr) / 2),
+        "view_rmse": rmse(view.psnr),
+        "pose_rmse": rmse(pose.psnr),
+        "head_rmse": rmse(view.psnr_head),
+    }
 
 
 def rmse(psnr: float) -> float:
