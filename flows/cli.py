@@ -114,6 +114,8 @@ def run(
             )
             if budget is not None:
                 request = _within(request, budget, preset, console)
+            elif not list_subjects:
+                console.print(_cited(request.preset), soft_wrap=True, highlight=False)
             if list_subjects:
                 paths = _list_here(request, console)
             else:
@@ -123,6 +125,12 @@ def run(
         raise typer.Exit(EXIT_INTERRUPTED) from None
     for name, path in paths.items():
         console.print(f"{name:<20} {path}", soft_wrap=True, highlight=False)
+
+
+def _cited(preset: str) -> str:
+    from tasks.cost.measured import cited, packaged_set
+
+    return cited(preset, packaged_set())
 
 
 def _within(request: VideoRequest, budget: str, preset: str | None, console: Console) -> VideoRequest:

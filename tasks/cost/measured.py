@@ -81,6 +81,15 @@ def _stage_times(rows: Sequence[Measurement]) -> Iterator[tuple[str, Knobs, floa
             yield row.sweep.partition(".")[0], row.knobs, row.cpu_s.median
 
 
+def cited(preset: str, measured: MeasuredSet) -> str:
+    """What a preset costs and scores, from its row."""
+    row = measured.whole_row("preset", preset)
+    if row is None or row.cpu_s is None:
+        return f"preset {preset}: no whole run of it has been measured yet (docs/cost.md, omissions)"
+    known = psnr(row.errors["rmse"])
+    return f"preset {preset}: {row.cpu_s.median / 60:.1f} CPU minutes, {known:.2f} dB on {row.capture} (docs/cost.md)"
+
+
 def write_measured(path: Path, rows: Sequence[Measurement], facts: Mapping[str, Any]) -> None:
     """Write the set as JSON, a row a line."""
     kept = [json.dumps(dataclasses.asdict(row)) for row in rows if not row.failed]
