@@ -15,6 +15,8 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
+from pydantic import BaseModel
+
 from ahoy_core.avatar.files import load_avatar
 from ahoy_core.captures import Capture
 from ahoy_core.cost.sweep import Measurement, Spread, sweep
@@ -73,54 +75,76 @@ def stage_rows(
         rows: where they are kept; those that are there are not measured again.
         told: called with a line on each knob.
     """
-    stage, subject = declared.stage, base.subject
-    run = subject.run()
-    inputs = _inputs(base, declared, run)
-    manifests, folders = resolve_inputs(stage, inputs, base.store)
-    config = getattr(subject.settings("full"), stage.name)
     with tempfile.TemporaryDirectory() as scratch:
-        numbers = count()
-
-        def make(setting: Mapping[str, Any]) -> Path:
-            chosen = {**config.model_dump(), **declared.knows(base.capture), **setting}
-            out = Path(scratch) / str(next(numbers))
-            out.mkdir()
-            ctx = StageContext(
-                folders, manifests, out, lambda done, total, note="": None, run.body, prior=run.prior, fills=run.fills
-            )
-            settings = type(config).model_validate(chosen)
-            declared.forget(settings, ctx)
-            stage.run(settings, ctx)
-            return out
-
-        def row_hash(setting: Mapping[str, Any]) -> str:
-            told_of = {name: str(value) for name, value in declared.knows(base.capture).items()}
-            made_by = {name: ref.content_hash for name, ref in inputs.items()}
-            return _hash(
-                [stage.name, stage.version, repeats, {**config.model_dump(mode="json"), **told_of, **setting}, made_by]
-            )
-
-        warmed = False
+        bench = _Bench(base, declared, Path(scratch))
         for knob, choices in values.items():
-            name = f"{stage.name}.{knob}"
-            hashes = {row_hash({knob: value}): {knob: value} for value in choices}
+            name = f"{declared.stage.name}.{knob}"
+            hashes = {bench.made_of({knob: value}, repeats): {knob: value} for value in choices}
             left = {made_of: setting for made_of, setting in hashes.items() if not rows.reuse(made_of, name, setting)}
             told(f"{base.capture.name}, {name}: {len(left)} of {len(hashes)} to measure")
-            if left and not warmed:
-                make(declared.warm_up)
-                warmed = True
-            found = sweep(
-                name,
-                left.values(),
-                make,
-                lambda made: declared.errors(base.capture, folders, made),
-                repeats=repeats,
-                warm=False,
-            )
-            given = _clip(folders["ingest"])
+            if left:
+                bench.warm()
+            found = sweep(name, left.values(), bench.make, bench.errors, repeats=repeats, warm=False)
             for made_of, row in zip(left, found, strict=True):
-                knobs = {**work_knobs(subject.settings("full"), given), **_named(stage.name, row.setting)}
+                knobs = bench.knobs(row.setting)
                 rows.add(replace(row, capture=base.capture.name, knobs=knobs, made_of=made_of))
+
+
+class _Bench:
+    """One stage on one capture's inputs, to be run at any setting.
+
+    Args:
+        base: capture and base settings.
+        declared: how the stage is swept.
+        scratch: where outputs go.
+    """
+
+    def __init__(self, base: Base, declared: StageSweep, scratch: Path) -> None:
+        self._capture, self._declared, self._scratch = base.capture, declared, scratch
+        self._settings, self._run = base.subject.settings("full"), base.subject.run()
+        self._config: BaseModel = getattr(self._settings, declared.stage.name)
+        refs = _inputs(base, declared, self._run)
+        self._hashes = {name: ref.content_hash for name, ref in refs.items()}
+        self._manifests, self._folders = resolve_inputs(declared.stage, refs, base.store)
+        self._numbers, self._warm = count(), False
+
+    def make(self, setting: Mapping[str, Any]) -> Path:
+        """Run the stage; returns the folder of its output."""
+        chosen = {**self._config.model_dump(), **self._declared.knows(self._capture), **setting}
+        config = type(self._config).model_validate(chosen)
+        out, run = self._scratch / str(next(self._numbers)), self._run
+        out.mkdir()
+        ctx = StageContext(self._folders, self._manifests, out, _untold, run.body, prior=run.prior, fills=run.fills)
+        self._declared.forget(config, ctx)
+        self._declared.stage.run(config, ctx)
+        return out
+
+    def warm(self) -> None:
+        """Run the stage once at its cheapest, unless that was done: compilation and caches are not what is measured."""
+        if not self._warm:
+            self.make(self._declared.warm_up)
+            self._warm = True
+
+    def errors(self, made: Path) -> Mapping[str, float]:
+        """Errors of an output folder."""
+        return self._declared.errors(self._capture, self._folders, made)
+
+    def made_of(self, setting: Mapping[str, Any], repeats: int) -> str:
+        """Hash of all that a row depends on."""
+        known = {name: str(value) for name, value in self._declared.knows(self._capture).items()}
+        knobs = {**self._config.model_dump(mode="json"), **known, **setting}
+        stage = self._declared.stage
+        return _hash([stage.name, stage.version, repeats, knobs, self._hashes])
+
+    def knobs(self, setting: Mapping[str, Any]) -> dict[str, Any]:
+        """What decides the work at a setting."""
+        changed = {f"{self._declared.stage.name}.{knob}": value for knob, value in setting.items()}
+        named = {name: value for name, value in changed.items() if name in KNOBS}
+        return {**work_knobs(self._settings, _clip(self._folders["ingest"])), **named}
+
+
+def _untold(done: int, total: int, note: str = "") -> None:
+    """Sweeps show no progress within a run."""
 
 
 def _inputs(base: Base, declared: StageSweep, run: Run) -> dict[str, StageRef]:
@@ -187,10 +211,6 @@ def _folder(store: ArtifactStore, ref: StageRef) -> Path:
     manifest = store.lookup(ref.key, stage=ref.stage, verify=False)
     assert manifest is not None  # it was made or found a moment ago
     return store.fetch(manifest)
-
-
-def _named(stage: str, setting: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: value for knob, value in setting.items() if (name := f"{stage}.{knob}") in KNOBS}
 
 
 def _clip(ingest: Path) -> dict[str, int]:

@@ -48,7 +48,7 @@ def texture_errors(capture: Capture, body: PackagedBody, fit: Fit, atlas: Mappin
         for name, camera in capture.cameras.items():
             truth = true_rgba(capture, View("view", name, frame))
             caster = Caster(to_camera(vertices, camera.viewmats[0].numpy()), surface.faces)
-            hits = hit_map(caster, camera.Ks[0].numpy(), camera.height, camera.width)
+            hits = hit_map(caster, camera.Ks[0].numpy(), camera.width, camera.height)
             where = (hits.face >= 0) & (truth[..., 3] > OPAQUE)
             where[where] = surface.textured[hits.face[where]]
             uv = interpolate_uv(surface, hits.face[where], hits.bary[where])

@@ -58,8 +58,7 @@ def write_truth(capture: Capture, body: PackagedBody, video: dict[str, np.ndarra
         fit[name] = fit[name][index]
     visible = clip.visible[index]
     hits = [_body_hits(body, fit, t, width, height) for t in range(len(index))]
-    regions = set(body.regions["head"].tolist())
-    on_head = np.asarray(np.isin(body.faces.numpy(), list(regions)).all(axis=1))
+    on_head = body.face_regions["head"].numpy()
     amodal = np.stack([hit >= 0 for hit in hits])
     head = np.stack([(hit >= 0) & on_head[hit] for hit in hits])
     seen = visible > 127
