@@ -11,6 +11,7 @@ from jinja2 import Environment, PackageLoader, select_autoescape
 from pydantic import BaseModel, ConfigDict
 
 from storage_schema.store import Manifest
+from tasks.roles import packaged
 from tasks.stage import Stage, StageContext, StageOutput
 
 STEPS = {
@@ -150,6 +151,8 @@ REPORT = Stage(
     ReportConfig,
     ("ingest", "perceive", "texture", "coarse", "avatar", "animate"),
     run_report,
+    # The bill is predicted from it.
+    lambda config: {"measured set": packaged("cost.json")},
     wants=("complete", "identity", "motions", "hallucinate"),
     explains=True,
 )

@@ -43,9 +43,7 @@ def _middle(completed: bool, seen: bool, tmp_path: Path) -> tuple[np.ndarray, fl
 def test_the_mesh_shows_what_was_seen_grey_elsewhere_or_what_was_filled(tmp_path: Path) -> None:
     seen, within = _middle(completed=False, seen=True, tmp_path=tmp_path)
     assert np.allclose(seen, (200, 20, 20), atol=2)
-    assert (
-        within > 0.97
-    )  # the same body in the same pose; at 64 pixels the avatar's Gaussians stand well beyond the skin
+    assert within > 0.97  # the same body and pose; the Gaussians stand well beyond the skin
     assert np.allclose(_middle(completed=False, seen=False, tmp_path=tmp_path)[0], 128, atol=2)
     assert np.allclose(_middle(completed=True, seen=False, tmp_path=tmp_path)[0], (20, 20, 200), atol=2)
 
