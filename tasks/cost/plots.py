@@ -48,6 +48,11 @@ def draw(rows: Sequence[Measurement], error: str, unit: str, path: Path, minutes
         xlabel="CPU minutes a video" if minutes else "CPU seconds",
         ylabel=f"{error.replace('_', ' ')}, {unit}",
     )
+    for axis, values in zip((axes.xaxis, axes.yaxis), at(there), strict=True):
+        axis.set_major_formatter("{x:g}")
+        # Less than a decade has one power of ten at most, and no number beside it to read the axis by.
+        if max(values) < 10 * min(values):
+            axis.set_minor_formatter("{x:.4g}")
     axes.legend(fontsize=8)
     axes.grid(which="both", lw=0.3)
     figure.savefig(path, dpi=100)
