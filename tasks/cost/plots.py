@@ -37,7 +37,7 @@ def draw(rows: Sequence[Measurement], error: str, unit: str, path: Path, minutes
 
     figure, axes = pyplot.subplots(figsize=(7.5, 4.8), layout="constrained")
     for name in dict.fromkeys(row.sweep for row in there):
-        mine = [row for row in there if row.sweep == name]
+        mine = sorted((row for row in there if row.sweep == name), key=lambda row: row.cpu_s.median if row.cpu_s else 0)
         axes.plot(*at(mine), "o-", ms=4, lw=1, label=name.partition(".")[2])
         for row, x, y in zip(mine, *at(mine), strict=True):
             axes.annotate(shown(row.setting), (x, y), textcoords="offset points", xytext=(4, 4), size=7)
