@@ -10,9 +10,10 @@ capture and configuration, after one that names the machine:
 - `coarse` (= `A`): the coarse avatar from the video alone.
 
 `psnr_novel_view` is over frames 6, 18, 30, 42 of all cameras, `psnr_novel_pose` over the unseen motion, `psnr_head`
-over the head's box of the former; all in the box of the true alpha over grey 0.5 at the capture's size, mean of
-pictures. `seconds`, `cpu_seconds` and `peak_mb` (of the process) are those of the training; `fps` is posing and
-rendering one frame of the unseen motion at that size, every pose new. `held_out` is the score under `input-view`.
+over the head's box of the former, means of pictures; by the renderer and the metrics of `ahoy evaluate` (regions `box`
+and `head` of docs/metrics.md), without its rounding to 8 bits. `seconds`, `cpu_seconds` and `peak_mb` (of the process)
+are those of the training; `fps` is posing and rendering one frame of the unseen motion at that size, every pose new.
+`held_out` is the score under `input-view`.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ import argparse
 import json
 import os
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -38,20 +39,21 @@ from ahoy_core.avatar.kinematics import Kinematics
 from ahoy_core.avatar.render import render
 from ahoy_core.avatar.supervision import CoarseInputs
 from ahoy_core.body.packaged import PackagedBody, load_packaged_body
+from ahoy_core.captures import Capture, View, read_dataset
+from ahoy_core.captures.fit import Clip, Fit, posed_vertices, read_clip, true_fit
 from ahoy_core.conventions import OBSERVED_VIEWMAT, Cameras
 from ahoy_core.cost import Meter, machine
 from ahoy_core.formats.images import to_float
 from ahoy_core.maps.template import Template
 from ahoy_core.perceive.masks import silhouette
 from ahoy_core.texture.texture import Texture, build_texture
-from benchmarks.avatar_scores import scores
 from benchmarks.avatar_supervision import TESTED, inconsistent, true_faces, true_sequences
-from benchmarks.captures import Capture, capture_folders, posed_vertices, read_capture, true_fit
+from tasks.evaluation.scoring import AvatarScores, score_avatar
+from tasks.fills import Fills
 from tasks.presets import PRESETS
 from tasks.roles import perceptual_network
 from tasks.settings import Settings
 
-Fit = Mapping[str, NDArray[np.generic]]
 CAMERAS = ("front", "left", "back", "right")
 CONFIGS = ("upper", *(f"upper-{name}" for name in CAMERAS), "coarse", "full", "C1", "C2", "C", "C3", "D")
 
@@ -59,13 +61,13 @@ CONFIGS = ("upper", *(f"upper-{name}" for name in CAMERAS), "coarse", "full", "C
 class Subject:
     """One capture with what every configuration starts from."""
 
-    def __init__(self, folder: Path, body: PackagedBody, settings: Settings) -> None:
-        self.capture, self.body, self.settings = read_capture(folder), body, settings
-        self.fit = true_fit(self.capture, body)
-        texture = build_texture(self.capture.frames, self.capture.visible, self.fit, body, settings.texture)
-        self.inputs = coarse_inputs(self.capture, body, self.fit, texture)
+    def __init__(self, capture: Capture, body: PackagedBody, settings: Settings) -> None:
+        self.capture, self.body, self.settings = capture, body, settings
+        clip, self.fit = read_clip(capture), true_fit(capture, body)
+        texture = build_texture(clip.frames, clip.visible, self.fit, body, settings.texture)
+        self.inputs = coarse_inputs(clip, body, self.fit, texture)
         self.template: Template = textured_template(self.inputs, settings.coarse.map_size)
-        novel = true_fit(self.capture, body, "novel_motion.npz")
+        novel = true_fit(self.capture, body, "pose")
         self.novel = torch.from_numpy(novel["pose"]), torch.from_numpy(novel["transl"])
 
     def full_inputs(self, config: str) -> FullInputs:
@@ -93,9 +95,9 @@ def measure(subject: Subject, config: str, sheets: Path | None) -> dict[str, Any
     facts: dict[str, Any] = {}
     with Meter() as meter:
         if config == "coarse":
-            result = train_coarse(subject.inputs, subject.settings.coarse, info, perceptual=perceptual_network())
+            result = train_coarse(subject.inputs, subject.settings.coarse, info, perceptual=perceptual_network(Fills()))
         else:
-            made = train_full(subject.full_inputs(config), settings, info, perceptual=perceptual_network())
+            made = train_full(subject.full_inputs(config), settings, info, perceptual=perceptual_network(Fills()))
             result = made
             facts = {"corrections": {name: round(value, 3) for name, value in made.corrections.items()}}
     bill = meter.read()
@@ -103,18 +105,18 @@ def measure(subject: Subject, config: str, sheets: Path | None) -> dict[str, Any
     cameras = (config.removeprefix("upper-"),) if config.startswith("upper-") else CAMERAS
     view, pose = _scored(subject, result.avatar, cameras, sheets, config)
     return {
-        "capture": subject.capture.folder.name,
+        "capture": subject.capture.name,
         "config": config,
-        "psnr_novel_view": view["psnr"],
-        "psnr_novel_pose": pose["psnr"],
-        "psnr_head": view["psnr_head"],
+        "psnr_novel_view": round(view.psnr, 2),
+        "psnr_novel_pose": round(pose.psnr, 2),
+        "psnr_head": round(view.psnr_head, 2),
         "seconds": round(bill.wall_s, 1),
         "cpu_seconds": round(bill.cpu_s, 1),
         "fps": _fps(subject, result.avatar),
         "peak_mb": bill.peak_rss_mb,
-        "iou_novel_view": view["iou"],
-        "iou_novel_pose": pose["iou"],
-        "psnr_head_novel_pose": pose["psnr_head"],
+        "iou_novel_view": round(view.iou, 4),
+        "iou_novel_pose": round(pose.iou, 4),
+        "psnr_head_novel_pose": round(pose.psnr_head, 2),
         "held_out": [round(held_out.psnr_before, 2), round(held_out.psnr_after, 2)] if held_out else None,
         "gaussians": len(result.avatar),
         "steps": len(result.losses),
@@ -131,15 +133,16 @@ def upper_bound(config: FullConfig) -> FullConfig:
 
 def _scored(
     subject: Subject, avatar: Avatar, cameras: Sequence[str], sheets: Path | None, config: str
-) -> tuple[dict[str, float], dict[str, float]]:
+) -> tuple[AvatarScores, AvatarScores]:
     capture, body = subject.capture, subject.body
-    name = f"{capture.folder.name}_{config}"
+    name = f"{capture.name}_{config}"
     paths = (None, None) if sheets is None else (sheets / f"{name}_view.png", sheets / f"{name}_pose.png")
-    poses, places = subject.inputs.pose, subject.inputs.transl
-    view = scores(capture, body, avatar, poses, places, TESTED, cameras, sheet=paths[0])
-    count = range(len(subject.novel[0]))
-    pose = scores(capture, body, avatar, *subject.novel, count, cameras, "novel", sheet=paths[1])
-    return view, pose
+    seen = [View("view", camera, frame) for frame in TESTED for camera in cameras]
+    unseen = [view for view in capture.of("pose") if view.camera in cameras]
+    return (
+        score_avatar(avatar, body, capture, seen, sheet=paths[0]),
+        score_avatar(avatar, body, capture, unseen, sheet=paths[1]),
+    )
 
 
 @torch.no_grad()
@@ -153,7 +156,7 @@ def _fps(subject: Subject, avatar: Avatar) -> float:
     return round(len(subject.novel[0]) / (time.process_time() - start), 1)
 
 
-def coarse_inputs(capture: Capture, body: PackagedBody, fit: Fit, texture: Texture) -> CoarseInputs:
+def coarse_inputs(clip: Clip, body: PackagedBody, fit: Fit, texture: Texture) -> CoarseInputs:
     """What the stages before would hand to the training."""
     views = to_float(texture.views)
     viewmats, Ks = torch.from_numpy(texture.viewmats), torch.from_numpy(texture.Ks)
@@ -161,11 +164,9 @@ def coarse_inputs(capture: Capture, body: PackagedBody, fit: Fit, texture: Textu
     return CoarseInputs(
         body=body,
         **arrays,
-        frames=torch.from_numpy(np.ascontiguousarray(np.moveaxis(capture.frames, -1, 1))),
-        masks=torch.from_numpy(capture.visible),
-        silhouettes=torch.from_numpy(
-            np.stack([_silhouette(body, fit, t, capture) for t in range(len(capture.frames))])
-        ),
+        frames=torch.from_numpy(np.ascontiguousarray(np.moveaxis(clip.frames, -1, 1))),
+        masks=torch.from_numpy(clip.visible),
+        silhouettes=torch.from_numpy(np.stack([_silhouette(body, fit, t, clip) for t in range(len(clip.frames))])),
         confidence=torch.from_numpy(fit["frame_confidence"]),
         views=views,
         view_coverage=torch.from_numpy(texture.view_coverage).float() / 255,
@@ -175,12 +176,12 @@ def coarse_inputs(capture: Capture, body: PackagedBody, fit: Fit, texture: Textu
     )
 
 
-def _silhouette(body: PackagedBody, fit: Fit, frame: int, capture: Capture) -> NDArray[np.uint8]:
+def _silhouette(body: PackagedBody, fit: Fit, frame: int, clip: Clip) -> NDArray[np.uint8]:
     """Alpha [H,W] of the fitted body; it is turned in front of the camera that `silhouette` assumes."""
     viewmat = fit["viewmat"].astype(np.float32)
     seen = posed_vertices(body, fit, frame) @ viewmat[:3, :3].T + viewmat[:3, 3]
     turned = seen @ OBSERVED_VIEWMAT.numpy()[:3, :3]
-    height, width = capture.frames.shape[1:3]
+    height, width = clip.frames.shape[1:3]
     return silhouette(turned, body.faces.numpy(), fit["K"].astype(np.float32), height, width)
 
 
@@ -202,10 +203,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if options.sheets is not None:
         options.sheets.mkdir(parents=True, exist_ok=True)
     lines = [json.dumps({"machine": machine(), "threads": options.threads, "preset": options.preset})]
-    for folder in capture_folders(options.captures):
-        if options.only not in (None, folder.name):
+    for capture in read_dataset(options.captures, "ours"):
+        if options.only not in (None, capture.name):
             continue
-        subject = Subject(folder, body, settings)
+        subject = Subject(capture, body, settings)
         for config in options.configs:
             lines.append(json.dumps({**measure(subject, config, options.sheets), "set": options.set}))
             print(lines[-1], flush=True)

@@ -26,11 +26,10 @@ from ahoy_core.avatar.head import FaceViews, body_shares, head_reach, head_zone
 from ahoy_core.avatar.kinematics import Kinematics
 from ahoy_core.body.packaged import PackagedBody
 from ahoy_core.body.rotations import axis_angle_to_matrix, matrix_to_axis_angle, so3_exp
+from ahoy_core.captures import Capture, View
 from ahoy_core.conventions import GREY, Cameras
-from ahoy_core.formats.images import to_float
 from ahoy_core.maps.template import Template
 from ahoy_core.metrics.regions import mask_box
-from benchmarks.captures import Capture
 
 TRAINED = (0, 12, 24, 36)
 TESTED = (6, 18, 30, 42)
@@ -49,13 +48,13 @@ def true_sequences(capture: Capture, pose: Tensor, transl: Tensor, cameras: Sequ
         chosen[0].height,
     )
     for frame in TRAINED:
-        pictures = torch.stack([to_float(capture.truth(name, frame)) for name in cameras])
-        alphas = pictures[:, 3]
+        pictures = [capture.picture(View("view", name, frame)) for name in cameras]
+        rgb, alphas = torch.stack([one.rgb for one in pictures]), torch.stack([one.alpha for one in pictures])
         made.append(
             Supervision(
                 name=f"frame {frame}",
                 kind="static",
-                frames=pictures[:, :3] * alphas[:, None] + GREY * (1 - alphas[:, None]),
+                frames=rgb * alphas[:, None] + GREY * (1 - alphas[:, None]),
                 coverage=torch.zeros_like(alphas),
                 map_pose=pose[frame],
                 pose=pose[frame].expand(len(cameras), -1, -1),

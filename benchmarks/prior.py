@@ -21,6 +21,8 @@ from torch import Tensor
 
 from ahoy_core.body.packaged import PackagedBody, load_packaged_body
 from ahoy_core.body.rotations import axis_angle_to_matrix
+from ahoy_core.captures import Capture, View, read_dataset
+from ahoy_core.captures.fit import posed_vertices, read_clip, true_fit, true_frames
 from ahoy_core.conventions import Cameras
 from ahoy_core.cost import machine
 from ahoy_core.prior.canonical import CanonicalFill, check_prior
@@ -39,7 +41,6 @@ from ahoy_core.prior.text import IDENTITY_PROMPT
 from ahoy_core.prior.video import VideoModel, load_video
 from ahoy_core.texture.atlas import ObservedAtlas
 from ahoy_core.texture.texture import TextureConfig, build_texture
-from benchmarks.captures import Capture, capture_folders, posed_vertices, read_capture, true_fit
 
 _BUDGETS = (16, 32)
 _REFERENCE_STEPS = 32  # of RK4: 128 evaluations
@@ -52,9 +53,9 @@ _HELD_OUT = tuple(split for split in SPLITS if split != "train")
 
 def static_views(capture: Capture, body: PackagedBody) -> Frames:
     """The four cameras of the first scored frame, whole, as person images."""
-    fit, number = true_fit(capture, body), capture.scored_frames()[0]
+    fit, number = true_fit(capture, body), true_frames(capture)[0]
     vertices = torch.from_numpy(posed_vertices(body, fit, number))[None].expand(4, -1, -1)
-    pictures = [torch.from_numpy(capture.truth(name, number)).permute(2, 0, 1).float() / 255 for name in _CAMERAS]
+    pictures = [capture.picture(View("view", name, number)) for name in _CAMERAS]
     views = [capture.cameras[name] for name in _CAMERAS]
     cameras = Cameras(
         torch.cat([view.viewmats for view in views]),
@@ -63,21 +64,21 @@ def static_views(capture: Capture, body: PackagedBody) -> Frames:
         views[0].height,
     )
     root = axis_angle_to_matrix(torch.from_numpy(fit["pose"][number, 0])).expand(4, 3, 3)
-    rgba = torch.stack(pictures)
-    return subject_frames(rgba[:, :3], rgba[:, 3:], cameras, body, vertices, root)
+    rgb, alpha = torch.stack([one.rgb for one in pictures]), torch.stack([one.alpha for one in pictures])
+    return subject_frames(rgb, alpha[:, None], cameras, body, vertices, root)
 
 
 def video_frames(capture: Capture, body: PackagedBody) -> Frames:
     """Frames of the occluded video, evenly spread, as person images."""
-    fit = true_fit(capture, body)
-    numbers = torch.linspace(0, len(capture.frames) - 1, _IDENTITY_FRAMES).round().int().tolist()
+    fit, clip = true_fit(capture, body), read_clip(capture)
+    numbers = torch.linspace(0, len(clip.frames) - 1, _IDENTITY_FRAMES).round().int().tolist()
     vertices = torch.stack([torch.from_numpy(posed_vertices(body, fit, n)) for n in numbers])
     front = capture.cameras["front"]
     count = len(numbers)
     cameras = Cameras(front.viewmats.expand(count, 4, 4), front.Ks.expand(count, 3, 3), front.width, front.height)
     root = axis_angle_to_matrix(torch.from_numpy(fit["pose"][numbers, 0]))
-    images = torch.from_numpy(capture.frames[numbers]).permute(0, 3, 1, 2).float() / 255
-    visible = torch.from_numpy(capture.visible[numbers])[:, None].float() / 255
+    images = torch.from_numpy(clip.frames[numbers]).permute(0, 3, 1, 2).float() / 255
+    visible = torch.from_numpy(clip.visible[numbers])[:, None].float() / 255
     return subject_frames(images, visible, cameras, body, vertices, root)
 
 
@@ -142,8 +143,8 @@ def capture_figures(load: Callable[[], VideoModel], capture: Capture, body: Pack
 
 def self_checked(video: VideoModel, capture: Capture, body: PackagedBody) -> dict[str, Any]:
     """The self-check on a capture's texture, from the true body."""
-    fit = true_fit(capture, body)
-    texture = build_texture(capture.frames, capture.visible, fit, body, TextureConfig(atlas_size=256, frame_stride=4))
+    fit, clip = true_fit(capture, body), read_clip(capture)
+    texture = build_texture(clip.frames, clip.visible, fit, body, TextureConfig(atlas_size=256, frame_stride=4))
     observed = ObservedAtlas(texture.observed_rgb, texture.coverage, texture.source_frame)
     check = check_prior(video, CanonicalFill(body, fit["betas"], observed))
     return {"errors": check.errors, "winner": check.winner, "regions": check.regions, "pixels": check.pixels}
@@ -178,8 +179,8 @@ def main() -> None:
     if "captures" in arguments.parts:
         body = load_packaged_body()
         found["captures"] = {
-            folder.name: capture_figures(lambda: load_video(arguments.prior), read_capture(folder), body)
-            for folder in capture_folders(arguments.captures)
+            capture.name: capture_figures(lambda: load_video(arguments.prior), capture, body)
+            for capture in read_dataset(arguments.captures, "ours")
         }
     arguments.json.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
 

@@ -20,8 +20,8 @@ import torch
 from ahoy_core.body.convert import to_local_ref
 from ahoy_core.body.keypoints import keypoints
 from ahoy_core.body.packaged import PackagedBody, load_packaged_body
+from ahoy_core.captures.body_errors import JOINTS24
 from ahoy_core.formats.video_write import write_mp4
-from benchmarks.captures import JOINTS24
 from benchmarks.rendered.people import Wardrobe
 from benchmarks.rendered.render import Picture, render
 from benchmarks.rendered.scenes import FPS, Scene, sample_scene, sample_view

@@ -15,7 +15,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -25,21 +25,18 @@ import torch
 from numpy.typing import NDArray
 
 from ahoy_core.body.packaged import PackagedBody, load_packaged_body
+from ahoy_core.captures import Capture, read_dataset
+from ahoy_core.captures.fit import Fit, read_clip, true_fit
+from ahoy_core.captures.texture_errors import texture_errors
 from ahoy_core.cost import Bill, Meter, machine
 from ahoy_core.roles import COMPLETIONS
 from ahoy_core.texture.atlas import ObservedAtlas
 from ahoy_core.texture.inputs import TextureConfig
 from ahoy_core.texture.links import texel_links
-from ahoy_core.texture.rays import Caster, hit_map, to_camera
 from ahoy_core.texture.selfcheck import patches, score_fillings, side_of
-from ahoy_core.texture.surface import Surface, interpolate_uv
-from ahoy_core.texture.texels import TexelMap, pad_charts, sample_atlas, texel_map, texel_normals
+from ahoy_core.texture.surface import Surface
+from ahoy_core.texture.texels import TexelMap, texel_map, texel_normals
 from ahoy_core.texture.texture import Texture, build_texture, canonical_vertices
-from benchmarks.captures import Capture, capture_folders, posed_vertices, read_capture, true_fit
-
-Fit = Mapping[str, NDArray[np.generic]]
-OPAQUE = 250  # of 255: pixels on the true outline mix in the background
-SURELY_SEEN = 0.9  # of 1: share of seen texels in what a bilinear lookup reads
 
 
 def drifting(frames: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -55,14 +52,14 @@ def measure(
     capture: Capture, body: PackagedBody, config: TextureConfig, shift_m: float, drift: bool, check: bool
 ) -> dict[str, Any]:
     """Make one texture and compare it with the true pictures."""
-    truth = true_fit(capture, body)
+    clip, truth = read_clip(capture), true_fit(capture, body)
     noise = np.random.default_rng(0).normal(0, shift_m, truth["transl"].shape).astype(np.float32)
     fit = {**truth, "transl": truth["transl"].astype(np.float32) + noise}
     clock: list[Bill] = []
     with Meter() as meter:
         texture = build_texture(
-            drifting(capture.frames) if drift else capture.frames,
-            capture.visible,
+            drifting(clip.frames) if drift else clip.frames,
+            clip.visible,
             fit,
             body,
             config,
@@ -70,19 +67,19 @@ def measure(
         )
     bill = meter.read()
     # The first call ends a frame that includes what is prepared once, so the loop is measured from there on.
-    per_frame = len(clock) / (len(clock) - 1) / len(capture.frames)
+    per_frame = len(clock) / (len(clock) - 1) / len(clip.frames)
     cpu_s = (clock[-1].cpu_s - clock[0].cpu_s) * per_frame
     return {
-        "capture": capture.folder.name,
+        "capture": capture.name,
         "seconds_per_frame": round((clock[-1].wall_s - clock[0].wall_s) * per_frame, 4),
         "cpu_seconds_per_frame": round(cpu_s, 4),
-        "cpu_seconds_once": round(bill.cpu_s - cpu_s * len(capture.frames), 2),
+        "cpu_seconds_once": round(bill.cpu_s - cpu_s * len(clip.frames), 2),
         "peak_mb": bill.peak_rss_mb,
         "observed": round(texture.notes["observed_share"], 3),
         "mirrored": round(texture.notes["mirrored_share"], 3),
         "diffused": round(texture.notes["diffused_share"], 3),
         "seam": seam(body, truth, texture),
-        **colour_scores(capture, body, truth, texture),
+        **texture_errors(capture, body, truth, texture.atlas_arrays()),
         **({"selfcheck": self_check(body, truth, texture)} if check else {}),
     }
 
@@ -123,43 +120,6 @@ def self_check(body: PackagedBody, fit: Fit, texture: Texture) -> dict[str, Any]
     return found
 
 
-def colour_scores(capture: Capture, body: PackagedBody, fit: Fit, texture: Texture) -> dict[str, float]:
-    """Look the texture up where the true pictures show the true body."""
-    surface = Surface.of(body)
-    seen_texels = pad_charts((texture.coverage > 0).astype(np.float32), texture.chart)
-    front: list[NDArray[np.float64]] = []
-    unseen: dict[str, list[NDArray[np.float64]]] = {name: [] for name in capture.cameras}
-    errors: list[NDArray[np.float64]] = []
-    known: list[NDArray[np.bool_]] = []
-    for frame in capture.scored_frames():
-        vertices = posed_vertices(body, fit, frame)
-        for name, camera in capture.cameras.items():
-            truth = capture.truth(name, frame)
-            caster = Caster(to_camera(vertices, camera.viewmats[0].numpy()), surface.faces)
-            hits = hit_map(caster, camera.Ks[0].numpy(), camera.height, camera.width)
-            where = (hits.face >= 0) & (truth[..., 3] > OPAQUE)
-            where[where] = surface.textured[hits.face[where]]
-            uv = interpolate_uv(surface, hits.face[where], hits.bary[where])
-            error = sample_atlas(texture.filled_rgb, uv).astype(np.float64) - truth[where][:, :3]
-            seen = sample_atlas(seen_texels, uv)
-            errors.append(error)
-            known.append(seen > 0.5)
-            unseen[name].append(error[seen <= 0.5])
-            if name == "front":
-                front.append(error[seen > SURELY_SEEN])
-    every, is_seen = np.concatenate(errors), np.concatenate(known)
-    return {
-        "texel_l1": round(float(np.abs(np.concatenate(front)).mean()), 2),
-        "unseen_l1": {name: round(float(np.abs(np.concatenate(rows)).mean()), 1) for name, rows in unseen.items()},
-        "psnr_seen": round(_psnr(every[is_seen]), 2),
-        "psnr_filled": round(_psnr(every[~is_seen]), 2),
-    }
-
-
-def _psnr(errors: NDArray[np.float64]) -> float:
-    return float(10 * np.log10(255**2 / np.square(errors).mean()))
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("captures", type=Path, help="folder of captures, laid out as their README says")
@@ -181,8 +141,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     varied = {knob: values.split(",") for knob, values in (pair.split("=", 1) for pair in options.vary)}
     body = load_packaged_body()
     lines = [json.dumps({"machine": machine(), "set": given, "shift_m": options.shift_m, "drift": options.drift})]
-    for folder in capture_folders(options.captures):
-        capture = read_capture(folder)
+    for capture in read_dataset(options.captures, "ours"):
         for values in product(*varied.values()):
             setting = dict(zip(varied, values, strict=True))
             config = TextureConfig.model_validate_strings({**given, **setting})

@@ -13,12 +13,14 @@ from rich.table import Table
 
 from flows import (
     batch_cli,
+    cost_cli,
     evaluate_cli,
     export_cli,
     models_cli,
     plan_cli,
     prior_cli,
     render_cli,
+    replay_cli,
     server_cli,
     store_cli,
     view_cli,
@@ -34,7 +36,8 @@ app.add_typer(models_cli.app, name="models")
 app.add_typer(prior_cli.app, name="prior")
 app.add_typer(store_cli.app, name="store")
 COMMANDS = (
-    *(batch_cli.submit, batch_cli.status, batch_cli.rerun, batch_cli.cancel, batch_cli.logs, plan_cli.plan),
+    *(batch_cli.submit, batch_cli.status, batch_cli.rerun, batch_cli.cancel, batch_cli.logs),
+    *(plan_cli.plan, cost_cli.cost, replay_cli.replay),
     *(server_cli.server, server_cli.worker, server_cli.install),
     *(render_cli.render, export_cli.export, view_cli.view, evaluate_cli.evaluate),
 )
@@ -61,7 +64,12 @@ def main(verbose: Annotated[bool, typer.Option("--verbose", "-v", help="log what
 def run(
     video: Annotated[str, typer.Argument(help="a video: a path or an address")],
     out: Annotated[Path, typer.Option(help="folder for the avatar, the videos and the report")],
-    preset: Annotated[str, typer.Option(help="draft, standard or high: how much time to spend")] = "standard",
+    preset: Annotated[
+        str | None, typer.Option(help="draft, standard or high: how much time to spend  [default: standard]")
+    ] = None,
+    budget: Annotated[
+        str | None, typer.Option(help="time to spend, such as 90s or 3m: the knobs that buy the most in it")
+    ] = None,
     subject: Annotated[
         str | None, typer.Option(help="which person, 0 for the most visible, or all: one avatar each")
     ] = None,
@@ -98,12 +106,16 @@ def run(
                     "video": video,
                     "out": str(out),
                     "store": store,
-                    "preset": preset,
+                    "preset": preset or "standard",
                     "subject": int(subject) if subject and subject.isdigit() else subject,
                     "stages": tuple(stages.split(",")) if stages else None,
                     "overrides": tuple(set_ or ()),
                 }
             )
+            if budget is not None:
+                request = _within(request, budget, preset, console)
+            elif not list_subjects:
+                console.print(_cited(request.preset), soft_wrap=True, highlight=False)
             if list_subjects:
                 paths = _list_here(request, console)
             else:
@@ -113,6 +125,25 @@ def run(
         raise typer.Exit(EXIT_INTERRUPTED) from None
     for name, path in paths.items():
         console.print(f"{name:<20} {path}", soft_wrap=True, highlight=False)
+
+
+def _cited(preset: str) -> str:
+    from tasks.cost.measured import cited, packaged_set
+
+    return cited(preset, packaged_set())
+
+
+def _within(request: VideoRequest, budget: str, preset: str | None, console: Console) -> VideoRequest:
+    """The request with the knobs that a budget buys."""
+    from flows.budget import budgeted
+    from flows.duration import seconds_of
+
+    if preset is not None:
+        raise ValueError(f"expected --preset or --budget, got both ({preset}, {budget}): a budget chooses the knobs")
+    chosen = budgeted(request, seconds_of(budget, "3m"))
+    for line in chosen.said:
+        console.print(line, soft_wrap=True, highlight=False)
+    return request.model_copy(update={"preset": chosen.preset, "overrides": chosen.overrides})
 
 
 def _run_here(request: VideoRequest, console: Console) -> dict[str, Path]:

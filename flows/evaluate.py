@@ -10,8 +10,8 @@ from __future__ import annotations
 import re
 import uuid
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,8 @@ from flows.evaluate_request import EvaluateRequest, OtherSystem
 from flows.pipeline import Outcome, call_directly, process
 from storage_schema.store import ArtifactStore
 from storage_schema.tables import Tables
+from tasks.evaluation.baseline_inputs import export_inputs
+from tasks.evaluation.baselines import BASELINES, mesh_renderer
 from tasks.evaluation.cell import MakeRenderer, avatar_renderer, evaluate_stage, reference_renderer
 from tasks.evaluation.config import EvaluateConfig
 from tasks.evaluation.fitted import Fitted
@@ -33,6 +35,7 @@ from tasks.evaluation.inputs import known_camera, truth_source, video_source
 from tasks.evaluation.results import Cell, read_metrics, write_results
 from tasks.evaluation.truths import Truths
 from tasks.evaluation.withhold import WITHHOLD, WithholdConfig
+from tasks.fills import fills_from_environment
 from tasks.presets import PRESETS
 from tasks.running import run_stage
 from tasks.settings import Settings
@@ -77,8 +80,19 @@ class Subject:
     def run(self) -> Run:
         """An attempt at a cell of this capture."""
         name = _UNSAFE.sub("-", self.capture.name).lstrip(".-_") or "capture"
-        body = PRESETS[self.request.preset].with_overrides(self.request.overrides).body
-        return Run(self.store, Tables(self.store), BATCH, name, uuid.uuid4().hex[:12], self.observer, body)
+        chosen = PRESETS[self.request.preset].with_overrides(self.request.overrides)
+        fills = fills_from_environment()
+        return Run(
+            self.store,
+            Tables(self.store),
+            BATCH,
+            name,
+            uuid.uuid4().hex[:12],
+            self.observer,
+            fills.body(chosen.body),
+            prior=chosen.prior,
+            fills=fills,
+        )
 
     def config(self, name: str, **more: Any) -> EvaluateConfig:
         """What the stage `evaluate` is told for a cell."""
@@ -137,6 +151,27 @@ def reference_cell(subject: Subject, name: str) -> Cell:
     outcome, perceived = stages_up_to(subject, "full", "perceive", subject.run())
     ref = score(subject, name, outcome, perceived, (), reference_renderer(name))
     return Cell(subject.capture.name, name, ref)
+
+
+def baseline_cell(subject: Subject, name: str) -> Cell:
+    """A built-in baseline on one capture."""
+    chosen = subject.request.model_copy(update={"overrides": (*subject.request.overrides, *BASELINES[name])})
+    mine = replace(subject, request=chosen)
+    outcome, perceived = stages_up_to(mine, "full", "texture", mine.run())
+    ref = score(mine, name, outcome, perceived, ("texture",), partial(mesh_renderer, name))
+    return Cell(subject.capture.name, name, ref)
+
+
+def export_inputs_of(subject: Subject, folder: Path) -> None:
+    """Write what other systems are given of one capture."""
+    outcome, perceived = stages_up_to(subject, "full", "complete", subject.run())
+    last = outcome.refs.get("complete", outcome.refs["texture"])
+    manifests = [
+        subject.store.lookup(ref.key, stage=ref.stage, verify=False)
+        for ref in (outcome.refs["ingest"], perceived, last)
+    ]
+    ingest, perceive, texture = (subject.store.fetch(manifest) for manifest in manifests if manifest)
+    export_inputs(ingest, perceive, texture, folder / subject.capture.name)
 
 
 def other_cell(subject: Subject, name: str) -> Cell:
@@ -202,7 +237,11 @@ def evaluate(
     subjects = [Subject(request, capture, store, observer) for capture in request.captures()]
     cells: list[Cell] = []
     for subject in subjects:
+        if request.export_inputs:
+            export_inputs_of(subject, Path(request.export_inputs))
+            told(f"{subject.capture.name}: inputs of other systems are in {request.export_inputs}")
         jobs: list[tuple[str, MakeCell]] = [(name, avatar_cell) for name in request.ablate]
+        jobs += [(name, baseline_cell) for name in request.baselines]
         jobs += [(OtherSystem.of(text).name, other_cell) for text in request.renders]
         jobs += [(name, reference_cell) for name in REFERENCES]
         for name, make in jobs:

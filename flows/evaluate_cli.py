@@ -29,19 +29,36 @@ def evaluate(
     renders: Annotated[
         list[str] | None, typer.Option(help="another system's renders, NAME=FOLDER[@INPUT_SETTING]; repeatable")
     ] = None,
+    baselines: Annotated[
+        bool, typer.Option("--baselines", help="score the textured body mesh and its mirrored completion too")
+    ] = False,
+    export_baseline_inputs: Annotated[
+        Path | None, typer.Option(help="write what other systems are given into this folder, a folder a capture")
+    ] = None,
     beside: Annotated[
         list[str] | None, typer.Option("--with", help="metrics.parquet of another evaluation, for the same tables")
     ] = None,
     withhold: Annotated[int, typer.Option(help="of a plain video, every n-th frame is withheld")] = 8,
     store: Annotated[str | None, typer.Option(help="URL of the artifact store  [default: OUT/store]")] = None,
     set_: Annotated[list[str] | None, typer.Option("--set", help="a knob, as STAGE.KNOB=VALUE; repeatable")] = None,
+    roles: Annotated[
+        Path | None, typer.Option(help="roles.yaml: which model fills each role  [default: AHOY_ROLES]")
+    ] = None,
+    role: Annotated[
+        list[str] | None, typer.Option("--role", help="one role, as ROLE=FILL:PATH or ROLE=embedded; repeatable")
+    ] = None,
+    trust_code: Annotated[
+        bool, typer.Option("--trust-code", help="TorchScript files that --role names are programs and may be run")
+    ] = False,
     prefect: Annotated[bool, typer.Option("--prefect", help="as a Prefect flow, watched at PREFECT_API_URL")] = False,
 ) -> None:
     """Score avatars against the truth; finished cells are found in the store and not made again."""
+    from flows import models_cli
     from flows.evaluate import evaluate as run_evaluation
     from flows.evaluate import evaluate_flow
     from flows.evaluate_request import EvaluateRequest
     from flows.terminal import TerminalObserver
+    from tasks.evaluation.baselines import BASELINES
     from tasks.evaluation.results import remarks
 
     console = Console()
@@ -59,11 +76,14 @@ def evaluate(
         "ablate": _names(ablate),
         "only": _names(only),
         "overrides": tuple(set_ or ()),
+        "baselines": tuple(BASELINES) if baselines else (),
+        "export_inputs": str(export_baseline_inputs) if export_baseline_inputs else None,
         "renders": tuple(renders or ()),
         "beside": tuple(beside or ()),
         **({"protocols": _names(protocols)} if protocols else {}),
     }
     with bad_input_said(console):
+        models_cli.choose_roles(roles, role or [], trust_code)
         request = EvaluateRequest.model_validate(fields)
         if prefect:
             paths = {name: Path(path) for name, path in evaluate_flow(request).items()}

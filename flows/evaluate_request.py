@@ -12,6 +12,7 @@ from ahoy_core.captures import KINDS, Capture, read_dataset
 from ahoy_core.metrics.protocol import PROTOCOLS
 from ahoy_core.metrics.score import REFERENCES
 from storage_schema.store import ArtifactStore
+from tasks.evaluation.baselines import BASELINES
 from tasks.evaluation.config import InputSetting
 from tasks.settings import Preset
 
@@ -38,7 +39,7 @@ class OtherSystem(NamedTuple):
                 f"expected NAME=FOLDER or NAME=FOLDER@SETTING with a folder that exists and a setting among "
                 f"{', '.join(settings)}, got {text!r}"
             )
-        if name in ABLATIONS or name in REFERENCES:
+        if name in ABLATIONS or name in REFERENCES or name in BASELINES:
             raise ValueError(f"expected another name than that of a configuration, got {name!r}")
         return cls(name, Path(folder), setting or settings[0])
 
@@ -62,6 +63,8 @@ class EvaluateRequest(BaseModel):
     protocols: tuple[str, ...] = Field(tuple(PROTOCOLS), description="names of protocols")
     size: int = Field(256, ge=32, le=4096, description="longest side of what is compared, pixels")
     renders: tuple[str, ...] = Field((), description="other systems: NAME=FOLDER or NAME=FOLDER@INPUT_SETTING")
+    baselines: tuple[str, ...] = Field((), description=f"built-in baselines: {', '.join(BASELINES)}")
+    export_inputs: str | None = Field(None, description="folder for what other systems are given")
     beside: tuple[str, ...] = Field((), description="metrics.parquet of earlier evaluations, for the same tables")
     withhold: int = Field(8, ge=2, description="of a plain video, every n-th frame is withheld")
 
@@ -70,6 +73,13 @@ class EvaluateRequest(BaseModel):
     def _known(cls, names: tuple[str, ...]) -> tuple[str, ...]:
         if unknown := [name for name in names if name not in ABLATIONS]:
             raise ValueError(f"expected configurations among {', '.join(ABLATIONS)}, got {', '.join(unknown)}")
+        return tuple(dict.fromkeys(names))
+
+    @field_validator("baselines")
+    @classmethod
+    def _built_in(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        if unknown := [name for name in names if name not in BASELINES]:
+            raise ValueError(f"expected baselines among {', '.join(BASELINES)}, got {', '.join(unknown)}")
         return tuple(dict.fromkeys(names))
 
     @field_validator("renders")

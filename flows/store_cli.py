@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -13,6 +12,8 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
+
+from flows.duration import seconds_of
 
 if TYPE_CHECKING:
     from storage_schema.collect import Orphan
@@ -24,7 +25,6 @@ console = Console()
 
 EXIT_BAD_INPUT = 2
 EXIT_DAMAGED = 4
-_SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86_400.0}
 _SHOWN = 20
 
 Url = Annotated[str, typer.Argument(help="folder or URL of the store")]
@@ -117,12 +117,10 @@ def _telling() -> Iterator[Callable[[str], None]]:
 
 
 def _age(text: str) -> float:
-    match = re.fullmatch(r"(\d+(?:\.\d+)?)([smhd])", text)
-    if match is None:
-        raise typer.BadParameter(
-            f"expected a number and s, m, h or d, such as 36h, got {text!r}", param_hint="--older-than"
-        )
-    return float(match.group(1)) * _SECONDS[match.group(2)]
+    try:
+        return seconds_of(text, "36h")
+    except ValueError as error:
+        raise typer.BadParameter(str(error), param_hint="--older-than") from None
 
 
 def _show_findings(findings: tuple[Finding, ...]) -> None:

@@ -91,6 +91,7 @@ ARTIFACTS: Mapping[str, tuple[Blob, ...]] = {
     ),
     "perceive": _PERCEIVED,
     "withhold": _PERCEIVED,  # the same, with frames that nothing may be learned from
+    "truth": _PERCEIVED,  # the same, from a capture's truth, for sweeps of later stages
     "subjects": (
         Blob("subjects.png"),  # a row of pictures for each person
         Blob("subjects.json"),  # number, frames, shots, size of each; which are worth an avatar

@@ -1,4 +1,8 @@
-"""Three ways to spend time, chosen by hand: no work-precision sweep stands behind them yet."""
+"""Three ways to spend time, chosen by hand.
+
+What each costs and scores is its row `preset` of the measured set (docs/cost.md, end to end), which `ahoy run` cites;
+where a preset has no row, that is among the omissions, and its knobs rest on the sweeps of single stages alone.
+"""
 
 from __future__ import annotations
 

@@ -11,6 +11,7 @@ from jinja2 import Environment, PackageLoader, select_autoescape
 from pydantic import BaseModel, ConfigDict
 
 from storage_schema.store import Manifest
+from tasks.roles import packaged
 from tasks.stage import Stage, StageContext, StageOutput
 
 STEPS = {
@@ -85,9 +86,14 @@ def page_environment() -> Environment:
 
 
 def _content(ctx: StageContext) -> dict[str, Any]:
+    # Presets hold this stage's configuration, and the measured set is round a preset.
+    from tasks.bill import run_bill
+    from tasks.cost.measured import packaged_set
+
     summaries = {name: manifest.summary for name, manifest in ctx.manifests.items()}
-    bills = [{"stage": name, **summary["bill"]} for name, summary in summaries.items()]
-    total = sum(bill["wall_s"] for bill in bills)
+    bill = run_bill(ctx, packaged_set())
+    total = sum(row.wall_s for row in bill.rows)
+    predicted = [row.predicted_s for row in bill.rows if row.predicted_s is not None]
     roles = {role: {"role": role, **who} for manifest in ctx.manifests.values() for role, who in manifest.roles.items()}
     return {
         "version": version("ahoy-avatars"),
@@ -103,9 +109,11 @@ def _content(ctx: StageContext) -> dict[str, Any]:
             for title, manifest in sorted(ctx.manifests.items())
             if manifest.stage == name
         ],
-        "bills": [{**bill, "share": 100 * bill["wall_s"] / max(total, 1e-9)} for bill in bills],
+        "bill": bill,
+        "shares": [100 * row.wall_s / max(total, 1e-9) for row in bill.rows],
         "total_wall": total,
-        "total_cpu": sum(bill["cpu_s"] for bill in bills),
+        "total_cpu": sum(row.cpu_s for row in bill.rows),
+        "total_predicted": sum(predicted) if predicted else None,
         "roles": list(roles.values()),
         "absent": [(STEPS.get(name, name), reason) for name, reason in ctx.skipped.items()],
     }
@@ -139,10 +147,12 @@ def _base64(path: Path) -> str:
 
 REPORT = Stage(
     "report",
-    3,
+    4,
     ReportConfig,
     ("ingest", "perceive", "texture", "coarse", "avatar", "animate"),
     run_report,
+    # The bill is predicted from it.
+    lambda config: {"measured set": packaged("cost.json")},
     wants=("complete", "identity", "motions", "hallucinate"),
     explains=True,
 )

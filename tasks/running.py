@@ -45,7 +45,7 @@ def run_stage(stage: Stage, config: BaseModel, inputs: Mapping[str, StageRef | S
     hashes = {name: value.content_hash for name, value in inputs.items()}
     if stage.explains and run.skipped:
         hashes["skipped"] = hashlib.sha256(json.dumps(run.skipped, sort_keys=True).encode()).hexdigest()
-    roles = {role: dataclasses.asdict(filled) for role, filled in _filled_by(stage, config, run).items()}
+    roles = {role: dataclasses.asdict(filled) for role, filled in filled_by(stage, config, run).items()}
     key = stage_key(
         stage.name,
         stage.version,
@@ -72,7 +72,7 @@ def run_stage(stage: Stage, config: BaseModel, inputs: Mapping[str, StageRef | S
     return ref
 
 
-def _filled_by(stage: Stage, config: BaseModel, run: Run) -> dict[str, Role]:
+def filled_by(stage: Stage, config: BaseModel, run: Run) -> dict[str, Role]:
     """Who fills the stage's roles; body and prior are the run's."""
     filled_by = run.fills.filled(stage.roles(config), stage.fillable)
     if "body" in filled_by:
@@ -106,7 +106,7 @@ def _make(
     roles: dict[str, dict[str, Any]],
     started: datetime,
 ) -> Manifest:
-    manifests, folders = _resolve(stage, inputs, run.store)
+    manifests, folders = resolve_inputs(stage, inputs, run.store)
     meter = Meter()
     try:
         with run.store.attempt(key, stage.name) as attempt, meter:
@@ -143,9 +143,14 @@ def _make(
     return manifest
 
 
-def _resolve(
+def resolve_inputs(
     stage: Stage, inputs: Mapping[str, StageRef | Source], store: ArtifactStore
 ) -> tuple[dict[str, Manifest], dict[str, Path]]:
+    """Manifests and folders of a stage's inputs.
+
+    Raises:
+        FileNotFoundError: an artifact is not whole in the store.
+    """
     manifests: dict[str, Manifest] = {}
     folders: dict[str, Path] = {}
     for name, value in inputs.items():

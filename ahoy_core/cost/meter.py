@@ -54,7 +54,7 @@ class Meter:
             return Bill()
         self._sample()
         wall, cpu = time.perf_counter() - self._start[0], time.process_time() - self._start[1]
-        return Bill(round(wall, 4), round(cpu, 4), round(self._peak / 2**20, 1))
+        return Bill(round(wall, 6), round(cpu, 6), round(self._peak / 2**20, 1))
 
     def _sample(self) -> None:
         self._peak = max(self._peak, self._process.memory_info().rss)

@@ -7,11 +7,12 @@ import gc
 import json
 import math
 import statistics
-import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
+
+from ahoy_core.cost.meter import Bill, Meter
 
 T = TypeVar("T")
 
@@ -41,6 +42,11 @@ class Measurement:
         errors: error measures against the reference, smaller is better; empty if the run failed.
         wall_s, cpu_s: seconds a run, over the repeats.
         failed: why there is no result; such rows are the list of omissions.
+        peak_mb: most memory that the process held while it ran, over the repeats.
+        capture: what it was measured on, where there are several.
+        knobs: `stage.knob` -> value of everything that decides the work, at this setting.
+        parts: stage -> CPU seconds, where the run is one of several stages.
+        made_of: hash of all that the row depends on; a row with the same need not be measured again.
     """
 
     sweep: str
@@ -49,6 +55,11 @@ class Measurement:
     wall_s: Spread | None = None
     cpu_s: Spread | None = None
     failed: str = ""
+    peak_mb: Spread | None = None
+    capture: str = ""
+    knobs: Mapping[str, Any] = field(default_factory=dict)
+    parts: Mapping[str, float] = field(default_factory=dict)
+    made_of: str = ""
 
 
 def sweep(
@@ -58,11 +69,13 @@ def sweep(
     error: Callable[[T], Mapping[str, float]],
     *,
     repeats: int = 5,
+    warm: bool = True,
 ) -> list[Measurement]:
     """Time `run` at every setting and compare what it returns with a reference.
 
     Settings take turns (A B C A B C ...), so that a machine that slows down half-way slows them all. Each is run once
-    uncounted first: compilation and caches are not what is measured.
+    uncounted first (`warm`): compilation and caches are not what is measured. An error that is no finite number is a
+    failure: the setting did not converge.
 
     Args:
         name: of the sweep.
@@ -70,34 +83,48 @@ def sweep(
         run: does the work at one setting.
         error: error measures of a result against the reference.
         repeats: counted runs per setting, at least 1.
+        warm: off, the first run counts too: for work of many seconds, warmed up by the caller.
     """
     if repeats < 1:
         raise ValueError(f"sweep {name}: expected repeats >= 1, got {repeats}; a row without a run has no time")
     rows = [dict(setting) for setting in settings]
     errors: dict[int, dict[str, float]] = {}
     failed: dict[int, str] = {}
-    times: dict[int, list[tuple[float, float]]] = {i: [] for i in range(len(rows))}
+    bills: dict[int, list[Bill]] = {i: [] for i in range(len(rows))}
     for i, setting in enumerate(rows):
         try:
-            errors[i] = {key: float(value) for key, value in error(run(setting)).items()}
+            result, bill = _billed(run, setting)
+            errors[i] = {key: float(value) for key, value in error(result).items()}
         except Exception as problem:  # a setting that fails is a finding, not the end of the sweep
             failed[i] = f"{type(problem).__name__}: {problem}"
-    for _ in range(repeats):
+            continue
+        if lost := [key for key, value in errors[i].items() if not math.isfinite(value)]:
+            failed[i] = f"did not converge: {', '.join(lost)} is no finite number"
+            del errors[i]
+        elif not warm:
+            bills[i].append(bill)
+    for _ in range(repeats if warm else repeats - 1):
         for i in errors:
-            times[i].append(_timed(run, rows[i]))
+            bills[i].append(_billed(run, rows[i])[1])
     return [
         Measurement(name, row, failed=failed[i])
         if i in failed
-        else Measurement(name, row, errors[i], Spread.of([t[0] for t in times[i]]), Spread.of([t[1] for t in times[i]]))
+        else Measurement(name, row, errors[i], *_spreads(bills[i])[:2], peak_mb=_spreads(bills[i])[2])
         for i, row in enumerate(rows)
     ]
 
 
-def _timed(run: Callable[[Mapping[str, Any]], T], setting: Mapping[str, Any]) -> tuple[float, float]:
+def _billed(run: Callable[[Mapping[str, Any]], T], setting: Mapping[str, Any]) -> tuple[T, Bill]:
     gc.collect()
-    wall, cpu = time.perf_counter(), time.process_time()
-    run(setting)
-    return time.perf_counter() - wall, time.process_time() - cpu
+    with Meter() as meter:
+        result = run(setting)
+    return result, meter.read()
+
+
+def _spreads(bills: Sequence[Bill]) -> tuple[Spread, Spread, Spread]:
+    """Wall seconds, CPU seconds and peak memory over the repeats."""
+    wall, cpu, peak = zip(*((bill.wall_s, bill.cpu_s, bill.peak_rss_mb) for bill in bills), strict=True)
+    return Spread.of(wall), Spread.of(cpu), Spread.of(peak)
 
 
 def pareto(rows: Iterable[Measurement], error: str) -> list[Measurement]:
@@ -119,10 +146,11 @@ def write_jsonl(path: Path, rows: Iterable[Measurement]) -> None:
 
 def read_jsonl(path: Path) -> list[Measurement]:
     """Inverse of `write_jsonl`."""
-    rows = []
-    for line in path.read_text(encoding="utf-8").splitlines():
-        value = json.loads(line)
-        for clock in ("wall_s", "cpu_s"):
-            value[clock] = Spread(**value[clock]) if value[clock] else None
-        rows.append(Measurement(**value))
-    return rows
+    return [row_of(json.loads(line)) for line in path.read_text(encoding="utf-8").splitlines()]
+
+
+def row_of(fields: Mapping[str, Any]) -> Measurement:
+    """A row from its JSON object."""
+    spreads = {name: Spread(**fields[name]) for name in ("wall_s", "cpu_s", "peak_mb") if fields.get(name)}
+    plain = {name: value for name, value in fields.items() if name not in ("wall_s", "cpu_s", "peak_mb")}
+    return Measurement(**{**plain, **spreads})

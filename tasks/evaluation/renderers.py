@@ -6,6 +6,7 @@ from collections.abc import Callable
 from functools import cached_property
 
 import torch
+from torch import Tensor
 
 from ahoy_core.avatar.avatar import Avatar
 from ahoy_core.avatar.render import render
@@ -20,32 +21,27 @@ Renderer = Callable[[Shot], Made | None]
 """Makes a picture; None where it has none for this shot."""
 
 
-class AvatarRenderer:
-    """An avatar, driven as the protocol says.
+class Driver:
+    """Poses for a body of its own shape, as the protocols say.
 
     Args:
-        avatar: who.
-        body: the model that it stands on.
+        body: the model.
+        betas: [S] the shape that was fitted.
         capture: whose true bodies drive it.
         fitted: what drives it where poses are estimated.
     """
 
-    def __init__(self, avatar: Avatar, body: BodyModel, capture: Capture, fitted: Fitted | None) -> None:
-        self._avatar, self._body, self._capture, self._fitted = avatar, body, capture, fitted
-        self._driven = {moment: drive(truth, body, avatar.betas) for moment, truth in capture.bodies.items()}
+    def __init__(self, body: BodyModel, betas: Tensor, capture: Capture, fitted: Fitted | None) -> None:
+        self.betas = betas
+        self._body, self._capture, self._fitted = body, capture, fitted
+        self._driven = {moment: drive(truth, body, betas) for moment, truth in capture.bodies.items()}
 
-    @torch.no_grad()
-    def __call__(self, shot: Shot) -> Made:
-        """Render one shot over grey."""
-        pose, transl = self._pose(shot)
-        posed = self._avatar.pose(self._body, pose, transl)
-        means, covars = posed.means, posed.covars
-        if shot.protocol == "novel-view-est":
-            means, covars = self._alignment.points(means), self._alignment.covariances(covars)
-        image, alpha = render(means, covars, posed.opacities, posed.colors, shot.camera)
-        return Made(image[0].clamp(0, 1), alpha[0, 0].clamp(0, 1))
+    def pose(self, shot: Shot) -> tuple[Tensor, Tensor]:
+        """Pose [J,3] and place [3] of a shot.
 
-    def _pose(self, shot: Shot) -> tuple[torch.Tensor, torch.Tensor]:
+        Raises:
+            ValueError: the frame has no fitted pose, and the protocol asks for one.
+        """
         view = shot.view
         if shot.protocol in ("novel-view-gt", "novel-pose-gt", "input-camera-gt"):
             poses, places = self._driven[view.moment]
@@ -58,9 +54,39 @@ class AvatarRenderer:
         return self._fitted.pose[fitted_row], self._fitted.transl[fitted_row]
 
     @cached_property
-    def _alignment(self) -> Similarity:
+    def alignment(self) -> Similarity:
+        """The similarity of `novel-view-est`."""
         assert self._fitted is not None
         return self._fitted.alignment(self._capture.bodies["view"], self._body)
+
+
+class AvatarRenderer:
+    """An avatar, driven as the protocol says.
+
+    Args:
+        avatar: who.
+        body: the model that it stands on.
+        capture: whose true bodies drive it.
+        fitted: what drives it where poses are estimated.
+    """
+
+    def __init__(self, avatar: Avatar, body: BodyModel, capture: Capture, fitted: Fitted | None) -> None:
+        self._avatar, self._body = avatar, body
+        self._driver = Driver(body, avatar.betas, capture, fitted)
+
+    @torch.no_grad()
+    def __call__(self, shot: Shot) -> Made:
+        """Render one shot over grey."""
+        pose, transl = self._pose(shot)
+        posed = self._avatar.pose(self._body, pose, transl)
+        means, covars = posed.means, posed.covars
+        if shot.protocol == "novel-view-est":
+            means, covars = self._driver.alignment.points(means), self._driver.alignment.covariances(covars)
+        image, alpha = render(means, covars, posed.opacities, posed.colors, shot.camera)
+        return Made(image[0].clamp(0, 1), alpha[0, 0].clamp(0, 1))
+
+    def _pose(self, shot: Shot) -> tuple[Tensor, Tensor]:
+        return self._driver.pose(shot)
 
 
 def reference(name: str) -> Renderer:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import av
@@ -16,6 +17,9 @@ from ahoy_core.formats.ply import read_ply
 from ahoy_core.formats.video import read_frames
 from storage_schema.store import ArtifactStore
 from storage_schema.tables import Tables
+from tasks.replaying import replay
+from tasks.stage import Run
+from tasks.texture import TEXTURE
 from tests.e2e.conftest import SmallRun, ahoy
 
 STAGES = ["ingest", "perceive", "texture", "coarse", "avatar", "animate", "report"]
@@ -94,6 +98,32 @@ def test_the_tables_hold_the_bill_the_frames_and_the_scores(small_run: SmallRun)
     assert all(row["cpu_s"] > 0 and row["peak_rss_mb"] > 0 for row in made.values())
     frames = [row for row in _rows(small_run, "frames") if row["used"]]
     assert frames and {len(row["transl"]) for row in frames} == {3}
+
+
+def test_the_report_has_the_bill_beside_its_prediction(small_run: SmallRun) -> None:
+    page = (small_run.folder / "report.html").read_text()
+    assert "predicted CPU seconds" in page and "times as many" in page
+
+
+def test_a_stage_replayed_alone_gives_what_it_gave(small_run: SmallRun) -> None:
+    result = ahoy("replay", str(small_run.folder), "texture")
+    assert result.exit_code == 0, result.output
+    assert result.output.count("the same, bit for bit") == 5 and "not as it was" not in result.output
+    refused = ahoy("replay", str(small_run.folder), "ingest")
+    assert refused.exit_code == 2 and "--video" in refused.output
+
+
+def test_a_replay_that_differs_says_where_and_what_has_changed_since(small_run: SmallRun, tmp_path: Path) -> None:
+    store = ArtifactStore(small_run.out / "store")
+    row = next(row for row in Tables(store).read("stages").to_pylist() if row["stage"] == "texture" and row["key"])
+    manifest = store.lookup(row["key"], stage="texture")
+    assert manifest is not None
+    run = Run(store, Tables(store), "replay", row["video_id"], "r", None)  # type: ignore[arg-type]
+    wider = replace(manifest, stage_version=1, config={**manifest.config, "atlas_size": 64})
+    done = replay(TEXTURE, wider, run, tmp_path, lambda done, total, note="": None)
+    said = {one.name: one.said for one in done.files}
+    assert not done.same and "coverage: (96, 96) then, (64, 64) now" in said["atlas.npz"]
+    assert done.changed == (f"version 1 of the stage then, {TEXTURE.version} now",)
 
 
 def test_stages_not_asked_for_are_skipped_with_the_reason(small_run: SmallRun) -> None:

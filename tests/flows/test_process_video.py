@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 from prefect.client.orchestration import get_client
 from prefect.client.schemas.objects import FlowRun, StateType
 from prefect.testing.utilities import prefect_test_harness
 
+from flows.evaluate import evaluate_flow
+from flows.evaluate_request import EvaluateRequest
 from flows.process_video import process_video
 from flows.request import VideoRequest
 from tests.e2e.conftest import SMALL, SmallRun, demo_clip, models, small_run  # noqa: F401  (session fixtures)
@@ -57,3 +60,22 @@ def test_a_failed_stage_fails_the_flow_with_its_own_error(server: None, tmp_path
     note.write_text("not a video")
     with pytest.raises(ValueError, match=r"note\.mp4"):
         process_video(VideoRequest(video=str(note), out=str(tmp_path / "out")))
+
+
+def test_an_evaluation_is_a_flow_with_a_task_a_cell(server: None, small_run: SmallRun) -> None:  # noqa: F811
+    request = EvaluateRequest(
+        dataset=str(small_run.clip),
+        out=str(small_run.out / "flow-scores"),
+        store=str(small_run.out / "store"),
+        ablate=("A",),
+        protocols=("held-out-frame",),
+        withhold=2,
+        overrides=SMALL,
+    )
+    paths = evaluate_flow(request)
+    assert "held-out-frame" in Path(paths["table.md"]).read_text()
+    with get_client(sync_client=True) as client:
+        (run,) = [run for run in client.read_flow_runs() if client.read_flow(run.flow_id).name == "evaluate"]
+        names = {task.name for task in client.read_task_runs() if task.flow_run_id == run.id}
+    assert run.state is not None and run.state.type == StateType.COMPLETED
+    assert {"demo A", "demo reference: shifted 2 px", "demo reference: flat colour"} <= names

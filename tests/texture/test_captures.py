@@ -10,21 +10,23 @@ import pytest
 import torch
 
 from ahoy_core.body.packaged import PackagedBody, load_packaged_body
+from ahoy_core.captures import read_dataset
+from ahoy_core.captures.fit import read_clip, true_fit
 from ahoy_core.texture.inputs import TextureConfig
 from ahoy_core.texture.rays import Caster, hit_map, to_camera
 from ahoy_core.texture.surface import Surface, interpolate_uv
 from ahoy_core.texture.texels import pad_charts, sample_atlas
 from ahoy_core.texture.texture import Texture, build_texture
-from benchmarks.captures import read_capture, true_fit
 
 
 @pytest.fixture(scope="module")
 def capture(shared_dir: Path) -> tuple[Path, PackagedBody, dict[str, np.ndarray], Texture]:
-    truth = read_capture(shared_dir / "captures" / "a")
+    (truth,) = read_dataset(shared_dir / "captures" / "a")
+    clip = read_clip(truth)
     body = load_packaged_body()
     fit = true_fit(truth, body)
     config = TextureConfig(atlas_size=256, frame_stride=8, canonical_height=256, canonical_width=192)
-    return truth.folder, body, fit, build_texture(truth.frames, truth.visible, fit, body, config)
+    return truth.folder, body, fit, build_texture(clip.frames, clip.visible, fit, body, config)
 
 
 @pytest.mark.shared

@@ -1,4 +1,4 @@
-"""The benchmarks' reader of captures, on a small capture made here."""
+"""A capture as the stages take it: clip, masks and the true fit, on a small capture made here."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ import torch
 
 from ahoy_core.body.convert import to_local_ref
 from ahoy_core.body.packaged import load_packaged_body
+from ahoy_core.captures import Capture, View, read_dataset
+from ahoy_core.captures.fit import posed_vertices, read_clip, true_fit, true_frames, true_rgba
 from ahoy_core.formats.video_write import write_mp4
-from benchmarks.captures import Capture, capture_folders, posed_vertices, read_capture, true_fit
 
 COUNT, HEIGHT, WIDTH = 3, 32, 48
 GREEN, RED = (0, 200, 0), (200, 0, 0)
@@ -45,22 +46,21 @@ def folder(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def capture(folder: Path) -> Capture:
-    return read_capture(folder)
+    return read_dataset(folder)[0]
 
 
-def test_video_masks_and_camera_are_read(capture: Capture) -> None:
-    assert capture.frames.shape == (COUNT, HEIGHT, WIDTH, 3)
-    assert np.abs(capture.frames.mean((0, 1, 2)) - GREEN).max() < 6
-    assert [mask.min() for mask in capture.visible] == [0, 10, 20]
-    camera = capture.cameras["front"]
-    assert (camera.height, camera.width) == (HEIGHT, WIDTH)
-    point = camera.viewmats[0] @ torch.tensor([0.0, 0.0, 2.0, 1.0])
-    assert point.tolist() == [0.0, -1.0, 5.0, 1.0]
+def test_the_clip_holds_video_masks_and_times(capture: Capture) -> None:
+    clip = read_clip(capture)
+    assert clip.frames.shape == (COUNT, HEIGHT, WIDTH, 3)
+    assert np.abs(clip.frames.mean((0, 1, 2)) - GREEN).max() < 6
+    assert [mask.min() for mask in clip.visible] == [0, 10, 20]
+    assert clip.times.tolist() == [0, 1 / 15, 2 / 15]
+    assert len(clip.first(2).frames) == len(clip.first(2).visible) == len(clip.first(2).times) == 2
 
 
-def test_true_pictures_are_rgba_in_that_order(capture: Capture) -> None:
-    assert capture.scored_frames() == [0, 2]
-    assert capture.truth("front", 2)[0, 0].tolist() == [*RED, 99]
+def test_true_pictures_are_rgba_in_levels(capture: Capture) -> None:
+    assert true_frames(capture) == [0, 2]
+    assert true_rgba(capture, View("view", "front", 2))[0, 0].tolist() == [*RED, 99]
 
 
 def test_the_true_body_stands_where_the_motion_says(capture: Capture) -> None:
@@ -76,17 +76,11 @@ def test_the_true_body_stands_where_the_motion_says(capture: Capture) -> None:
 def test_a_missing_mask_is_named(folder: Path) -> None:
     (folder / "vis" / "001.png").unlink()
     with pytest.raises(ValueError, match=r"001\.png"):
-        read_capture(folder)
+        read_clip(read_dataset(folder)[0])
 
 
 def test_masks_of_another_size_than_the_video_are_refused(folder: Path) -> None:
     for t in range(COUNT):
         cv2.imwrite(str(folder / "vis" / f"{t:03d}.png"), np.zeros((HEIGHT, WIDTH + 2), np.uint8))
     with pytest.raises(ValueError, match="masks"):
-        read_capture(folder)
-
-
-def test_a_folder_without_captures_is_refused_and_others_are_found(folder: Path, tmp_path: Path) -> None:
-    assert capture_folders(tmp_path) == [folder]
-    with pytest.raises(ValueError, match="none"):
-        capture_folders(folder)
+        read_clip(read_dataset(folder)[0])

@@ -1,0 +1,1 @@
+"""What accuracy costs: the knobs that are swept, what each is compared with, and what is made of the rows."""
