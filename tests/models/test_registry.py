@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
+import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -30,6 +32,21 @@ def test_every_adapter_declares_what_a_lawyer_and_an_operator_need(each: adapter
     assert each.files or each.is_command
     for file in each.files:
         assert all(c in "0123456789abcdef" for c in file.sha256) and len(file.sha256) <= 64
+
+
+def test_every_extra_asks_for_something_and_brings_what_its_adapters_import() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras: dict[str, list[str]] = project["optional-dependencies"]
+
+    def brought(extra: str) -> set[str]:
+        names = {re.split(r"[\[<>=]", wanted)[0] for wanted in extras[extra]}
+        inner = [name for wanted in extras[extra] for name in re.findall(r"ahoy-avatars\[(.+)\]", wanted)]
+        return names.union(*(brought(name) for group in inner for name in group.split(",")))
+
+    assert all(extras.values()), "an extra that asks for nothing promises something that it does not do"
+    for each in ADAPTERS:
+        assert each.extra is None or set(each.packages) <= brought(each.extra), each.label
+        assert each.extra is None or set(each.packages) <= brought("all"), each.label
 
 
 def test_names_are_told_apart() -> None:
