@@ -197,6 +197,7 @@ def build(role: str, name: str, folder: Path) -> Fill:
         path=BUILDERS[role, name](folder),
         device="cpu",
         trust_code=adapter(role, name).is_code,
+        own_weights=any(file.sha256 for file in adapter(role, name).files),
         options=OPTIONS.get((role, name), {}),
     )
 

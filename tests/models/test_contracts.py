@@ -5,7 +5,6 @@ Shapes, ranges, dtypes, the same answer under the same seed, empty and single-fr
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -15,35 +14,13 @@ from torch import Tensor
 from ahoy_core.body.packaged import load_packaged_body
 from ahoy_core.conventions import Cameras, look_at, orbit_eyes, perspective_K
 from ahoy_core.metrics.stlpips import StLpips
-from ahoy_core.models.adapter import Fill
 from ahoy_core.models.catalogue import ADAPTERS, adapter
 from ahoy_core.prior.conditioning import Context
 from ahoy_core.texture.canonical import CanonicalViews
 from ahoy_core.texture.fillings import TexturedBody
-from tests.models.checkpoints import build
+from tests.models.conftest import Load, Tiny
 
 H, W = 72, 56
-Load = Callable[[str, str], Any]
-
-
-@pytest.fixture(scope="module")
-def load(tmp_path_factory: pytest.TempPathFactory) -> Load:
-    """Builds and loads each adapter once."""
-    loaded: dict[tuple[str, str], Any] = {}
-
-    def once(role: str, name: str) -> Any:
-        if (role, name) not in loaded:
-            fill = build(role, name, tmp_path_factory.mktemp(f"{role}-{name}"))
-            loaded[role, name] = adapter(role, name).open(fill)
-        return loaded[role, name]
-
-    return once
-
-
-@pytest.fixture(scope="module")
-def sam3(tmp_path_factory: pytest.TempPathFactory) -> Fill:
-    """One checkpoint for both modes."""
-    return build("mask", "sam3", tmp_path_factory.mktemp("sam3"))
 
 
 def names(role: str, *embedded: str) -> list[str]:
@@ -94,7 +71,8 @@ def test_pose(name: str, load: Load) -> None:
 
 @pytest.mark.parametrize("mode", ["image", "video"])
 @pytest.mark.parametrize("name", names("mask"))
-def test_mask(name: str, mode: str, sam3: Fill) -> None:
+def test_mask(name: str, mode: str, tiny: Tiny) -> None:
+    sam3 = tiny("mask", name)
     role = adapter("mask", name).open(sam3.model_copy(update={"options": {**sam3.options, "mode": mode}}))
     for count in (0, 1, 3):
         masks = role(frames(count), boxes(count))

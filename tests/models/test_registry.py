@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import importlib
 import re
 import subprocess
@@ -18,7 +19,7 @@ from ahoy_core.models.catalogue import ADAPTERS, adapter
 from ahoy_core.models.errors import CheckpointError, MissingPackageError, ModelError, UntrustedCodeError
 from tasks.fills import ENVIRONMENT, Fills, fills_from_environment, read_fills, with_flags
 from tasks.role import Role
-from tests.models.checkpoints import BUILDERS
+from tests.models.checkpoints import BUILDERS, build
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -111,8 +112,8 @@ def test_a_key_knows_contents_and_knobs_but_no_path_and_no_device(tmp_path: Path
     here, there = build(tmp_path / "here"), build(tmp_path / "there")
 
     def sha(**fields: object) -> str:
-        found = Fills({"perceptual": Fill(fill="lpips-alex", **fields)}).role("perceptual")  # type: ignore[arg-type]
-        assert found is not None and found.name == "LPIPS v0.1 (AlexNet)"
+        found = Fills({"perceptual": Fill(fill="lpips-alex", own_weights=True, **fields)}).role("perceptual")  # type: ignore[arg-type]
+        assert found is not None and found.name == "LPIPS v0.1 (AlexNet), weights of the user's own"
         return found.weights_sha256
 
     assert sha(path=here) == sha(path=there, device="cpu")
@@ -122,11 +123,35 @@ def test_a_key_knows_contents_and_knobs_but_no_path_and_no_device(tmp_path: Path
     assert sha(path=there) != before
 
 
+def test_published_hashes_are_compared_and_a_file_is_read_again_only_when_it_changed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = BUILDERS["perceptual", "lpips-alex"](tmp_path)
+    declared = adapter("perceptual", "lpips-alex")
+    published = [
+        dataclasses.replace(f, sha256=hashlib.sha256((path / f.name).read_bytes()).hexdigest()) for f in declared.files
+    ]
+    honest = dataclasses.replace(declared, files=tuple(published))
+    fill = Fill(fill="lpips-alex", path=path, device="cpu")
+    assert honest.open(fill).name == "LPIPS v0.1 (AlexNet)"
+    assert all("as published" in words for words in honest.hashes(fill).values())
+    read: list[object] = []
+    whole = hashlib.file_digest
+    monkeypatch.setattr(hashlib, "file_digest", lambda file, kind: read.append(file) or whole(file, kind))
+    honest.require(fill)
+    assert not read
+    (path / "alex.pth").write_bytes((path / "alex.pth").read_bytes() + b"x")
+    with pytest.raises(CheckpointError, match=rf"published sha256 {published[1].sha256}, got .* own_weights: true"):
+        honest.open(fill)
+    assert len(read) == 1
+
+
 def test_a_model_is_loaded_once(tmp_path: Path) -> None:
     path = BUILDERS["perceptual", "lpips-alex"](tmp_path)
-    fills = Fills({"perceptual": Fill(fill="lpips-alex", path=path, device="cpu")})
+    own = Fill(fill="lpips-alex", path=path, device="cpu", own_weights=True)
+    fills = Fills({"perceptual": own})
     assert fills.preload() == ["perceptual"], "what works on the CPU can be handed to forks"
-    assert Fills({"perceptual": Fill(fill="lpips-alex", path=path, device="cuda")}).preload() == []
+    assert Fills({"perceptual": own.model_copy(update={"device": "cuda"})}).preload() == []
     assert fills.get("perceptual") is fills.get("perceptual")
     assert fills.get("mask") is None
 
@@ -149,7 +174,7 @@ def test_the_example_of_deploy_is_read_and_fills_every_role() -> None:
 
 def test_a_stage_keeps_its_defaults_where_nothing_is_chosen(tmp_path: Path) -> None:
     default = {"perceptual": Role("ST-LPIPS", "BSD-2-Clause", "1" * 64), "body": Role("b", "x")}
-    fills = Fills({"perceptual": Fill(fill="lpips-alex", path=BUILDERS["perceptual", "lpips-alex"](tmp_path))})
+    fills = Fills({"perceptual": build("perceptual", "lpips-alex", tmp_path)})
     assert fills.filled(default, ()) == default
     changed = fills.filled(default, ("perceptual",))
     assert changed["body"] == default["body"] and changed["perceptual"].name.startswith("LPIPS")
