@@ -50,7 +50,7 @@ class Fills:
         if role not in self.chosen:
             return None
         fill = self.chosen[role]
-        return _opened(role, fill.model_dump_json(), _weights_hash(fill))
+        return _opened(role, fill.model_dump_json(), _weights_hash(fill, adapter(role, fill.fill).companions(fill)))
 
     def role(self, role: str) -> Role | None:
         """Who fills a role, for keys, reports and metric rows; None for the embedded default.
@@ -64,7 +64,7 @@ class Fills:
         declared = adapter(role, fill.fill)
         declared.require(fill)
         title = declared.title + (OWN_WEIGHTS if fill.own_weights else "")
-        return Role(title, declared.licence, _identity(fill))
+        return Role(title, declared.licence, _identity(fill, declared.companions(fill)))
 
     def filled(self, defaults: Mapping[str, Role], fillable: tuple[str, ...]) -> dict[str, Role]:
         """A stage's roles, with those that are filled otherwise replaced or added."""
@@ -168,17 +168,20 @@ def _opened(role: str, said: str, weights: str) -> Any:
     return adapter(role, fill.fill).open(fill)
 
 
-def _identity(fill: Fill) -> str:
+def _identity(fill: Fill, companions: list[Path]) -> str:
     """What a key knows of a fill: its files' contents, its knobs and its command, never a path or a device."""
-    parts = (fill.fill, fill.dtype or "", json.dumps(fill.options, sort_keys=True), *fill.command, _weights_hash(fill))
+    weights = _weights_hash(fill, companions)
+    parts = (fill.fill, fill.dtype or "", json.dumps(fill.options, sort_keys=True), *fill.command, weights)
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()
 
 
-def _weights_hash(fill: Fill) -> str:
-    """Sha256 over names and contents of all files at the path."""
+def _weights_hash(fill: Fill, companions: list[Path]) -> str:
+    """Sha256 over names and contents of all files at the path, and of those that are used beside it."""
     if fill.path is None:
         return ""
     files = sorted(p for p in fill.path.rglob("*") if p.is_file()) if fill.path.is_dir() else [fill.path]
+    if not fill.path.is_dir():
+        files += companions
     root = fill.path if fill.path.is_dir() else fill.path.parent
     total = hashlib.sha256()
     for file in files:

@@ -83,6 +83,7 @@ class Adapter:
         licence_at: where its text is.
         source: where its owner gets the files.
         files: what has to be there.
+        beside: what is used if it lies in the folder of the checkpoint's file; part of its hash.
         parameters: billions, as published; 0 where there are none or they are not published.
         dtype: of the weights by default.
         device: "cpu" where a CPU is enough, else "cuda".
@@ -111,6 +112,7 @@ class Adapter:
     endings: tuple[str, ...] = ()
     is_code: bool = False
     is_command: bool = False
+    beside: tuple[ExpectedFile, ...] = ()
 
     @property
     def label(self) -> str:
@@ -174,6 +176,12 @@ class Adapter:
                         "own_weights: true in roles.yaml (or --own-weights)"
                     )
 
+    def companions(self, fill: Fill) -> list[Path]:
+        """The files of `beside` that are there, in its order."""
+        if fill.path is None:
+            return []
+        return [found for file in self.beside for found in _found(fill.path, file.name)]
+
     def hashes(self, fill: Fill) -> dict[str, str]:
         """The checkpoint's files that were looked for, by name: sha256, and whether it is the published one."""
         if fill.path is None:
@@ -183,7 +191,7 @@ class Adapter:
             for found in _found(fill.path, file.name) if file.name else [fill.path]:
                 against = "as published" if file.sha256 and not fill.own_weights else "not compared"
                 words[found.name] = f"{sha256_of(found)} ({against if file.sha256 else 'none published'})"
-        return words
+        return words | {found.name: f"{sha256_of(found)} (used beside it)" for found in self.companions(fill)}
 
     def how_to_get(self) -> str:
         """Where the right file is, for the end of an error."""

@@ -6,6 +6,10 @@ from typing import Final
 
 from ahoy_core.models.adapter import Adapter, ExpectedFile
 
+TABLE_FILE: Final = "UV_Processed.mat"
+"""DensePose's own name of its table of charts."""
+SMPL_FILES: Final = ("SMPL_NEUTRAL.npz", "SMPL_MALE.npz", "SMPL_FEMALE.npz")
+
 _WEIGHTS = ExpectedFile("*.safetensors", "weights; with *.safetensors.index.json where there are several files")
 
 PEOPLE: Final = (
@@ -64,6 +68,10 @@ PEOPLE: Final = (
         licence_at="github.com/facebookresearch/detectron2/blob/main/projects/DensePose/doc/DENSEPOSE_IUV.md",
         source="an export of densepose_rcnn_R_50_FPN_s1x (github.com/dajes/DensePose-TorchScript), as `path`",
         files=(ExpectedFile("", "densepose_rcnn_*.pt"),),
+        beside=(
+            ExpectedFile(TABLE_FILE, "DensePose's charts on SMPL's vertices: maps them to the body's UV"),
+            ExpectedFile("|".join(SMPL_FILES), "SMPL's own file, where the body is another: its licence binds you"),
+        ),
         endings=(".pt",),
         device="cuda",
         is_code=True,

@@ -81,6 +81,27 @@ def add_identity(video: VideoModel, rank: int, seed: int) -> None:
         for network in experts(video):
             network.requires_grad_(False)
             network.add_adapter(config, adapter_name=ADAPTER)
+            for parameter in network.parameters():
+                if parameter.requires_grad:  # updates are small: in half precision most would be lost
+                    parameter.data = parameter.data.float()
+
+
+@contextmanager
+def borrowed(video: VideoModel) -> Iterator[VideoModel]:
+    """A model for one subject: when the block ends, adapter and word are gone, and it is as it was loaded.
+
+    Loading a published model takes minutes, so a process keeps it for the next subject.
+    """
+    number = identity_token_id(video.components.tokenizer)
+    word = embedding_weight(video.components.text_encoder)[number].detach().clone()
+    try:
+        yield video
+    finally:
+        for network in experts(video):
+            if ADAPTER in getattr(network, "peft_config", {}):
+                network.unload_lora()
+        with torch.no_grad():
+            embedding_weight(video.components.text_encoder)[number] = word
 
 
 def has_identity(video: VideoModel) -> bool:
@@ -216,7 +237,7 @@ def _spoken(video: VideoModel, word: nn.Parameter) -> Iterator[None]:
     number = identity_token_id(video.components.tokenizer)
 
     def replaced(_: nn.Module, inputs: tuple[Tensor, ...], output: Tensor) -> Tensor:
-        return torch.where((inputs[0] == number)[..., None], word.to(output.dtype), output)
+        return torch.where((inputs[0] == number)[..., None], word.to(output), output)
 
     video.components.text_encoder.requires_grad_(False)
     hook = video.components.text_encoder.encoder.embed_tokens.register_forward_hook(replaced)

@@ -77,5 +77,6 @@ class PriorBody:
             torch.cat([front[None], given.frames[1:]]),
             torch.cat([silhouette[None], given.mask[1:]]),
             torch.cat([observed[None], given.coverage[1:]]),
+            moving=False,
         )
         return replace(self, pictures=pictures)
