@@ -22,6 +22,11 @@ PEOPLE: Final = (
         licence_at="smpl-x.is.tue.mpg.de/modellicense.html",
         source="smpl-x.is.tue.mpg.de after registration: SMPLX_NEUTRAL.npz, as `path`",
         files=(ExpectedFile("", "SMPL, SMPL+H or SMPL-X as .npz"),),
+        beside=(
+            ExpectedFile("uv.obj|smpl_uv.obj|smplx_uv.obj", "texture coordinates, where the file has none"),
+            ExpectedFile("SMPL-X__FLAME_vertex_ids.npy", "which vertices are the head"),
+            ExpectedFile("FLAME_NEUTRAL.npz|flame2023.npz|generic_model.npz", "FLAME, for its expressions"),
+        ),
         endings=(".npz",),
         load="ahoy_core.models.smpl_family:load_body_file",
     ),

@@ -107,7 +107,7 @@ class EmbeddedVideo:
         """See `VideoModel`."""
         times = _times(tau, latents)
         network = self.components.transformer
-        dtype = next(network.parameters()).dtype
+        dtype = _input_dtype(network)
         stacked = transformer_input(latents, context).to(dtype)
         steps = timesteps(times, latents, context.held)
         velocity = network(stacked, steps, context.text.to(dtype), return_dict=False)[0].to(latents)
@@ -167,7 +167,7 @@ class WanVideo:
         velocity = torch.empty_like(latents)
         for network in {id(n): n for n in (self.expert(float(t)) for t in times)}.values():
             rows = torch.tensor([self.expert(float(t)) is network for t in times])
-            dtype = next(network.parameters()).dtype
+            dtype = _input_dtype(network)
             steps = 1000 * times[rows]
             if self.components.expand_timesteps:
                 steps = timesteps(times[rows], latents[rows], None if held is None else held[rows])
@@ -190,6 +190,12 @@ def load_video(folder: Path, dtype: torch.dtype = torch.float32) -> EmbeddedVide
         return EmbeddedVideo(components)
     add_identity_token(components.tokenizer, components.text_encoder)
     return WanVideo(components)
+
+
+def _input_dtype(network: Any) -> torch.dtype:
+    """What a transformer takes. Its first parameters stay float32 whatever it was loaded as; its convolution tells."""
+    dtype: torch.dtype = network.patch_embedding.weight.dtype
+    return dtype
 
 
 def _times(tau: float | Tensor, latents: Tensor) -> Tensor:

@@ -80,17 +80,18 @@ def chart_map(table: ChartTable, placed: Array, surface: Surface, rest: Array) -
     corners = table.vertices[table.faces]
     normals = face_normals(placed, corners)
     found = hits.face >= 0
-    values = np.zeros((len(found), 6), np.float32)
+    values: Array = np.zeros((len(found), 6), np.float32)
     values[found, :3] = (placed[corners[hits.face[found]]] * hits.bary[found, :, None]).sum(1)
     values[found, 3:] = NORMAL_M * normals[hits.face[found]]
-    values, found = values.reshape(CHARTS, GRID, GRID, 6), found.reshape(CHARTS, GRID, GRID)
-    padded = np.stack([pad_charts(one, known) for one, known in zip(values, found, strict=True)])
+    cut = (CHARTS, GRID, GRID)
+    padded = np.stack(
+        [pad_charts(v, known) for v, known in zip(values.reshape(*cut, 6), found.reshape(cut), strict=True)]
+    )
     samples = texel_map(surface, SAMPLES)
     outward = NORMAL_M * face_normals(rest, surface.faces)[samples.face]
     ours = np.concatenate([samples.points(rest, surface.faces), outward], 1)
     _, nearest = cKDTree(ours).query(padded.reshape(-1, 6))
-    shape = (CHARTS, GRID, GRID)
-    return ChartMap(samples.face[nearest].reshape(shape), samples.bary[nearest].reshape(*shape, 3))
+    return ChartMap(samples.face[nearest].reshape(cut), samples.bary[nearest].reshape(*cut, 3))
 
 
 @dataclass(frozen=True)
