@@ -99,10 +99,10 @@ class Fills:
         Raises:
             ModelError: one cannot be loaded, or its files are not there.
         """
-        self.filled({}, tuple(self.chosen))
         roles = [role for role, fill in self.chosen.items() if not fill.command and fill.device == "cpu"]
         for role in roles:
             self.get(role)
+        self.filled({}, tuple(self.chosen))
         return roles
 
     def to_json(self) -> str:
