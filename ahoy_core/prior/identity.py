@@ -149,7 +149,7 @@ def train_identity(
     groups = [{"params": updates, "lr": config.lr}, {"params": [word], "lr": config.token_lr}]
     optimizer = torch.optim.AdamW(groups, betas=(0.9, 0.99), weight_decay=0.0)
     losses = []
-    with _spoken(video, word):
+    with _spoken(video, word), _checkpointed(video):
         for step in range(config.steps):
             rows = torch.randint(len(clean), (config.batch,), generator=generator)
             loss = _identity_loss(video, clean[rows], weight[rows], _context(video, frames, rows), generator)
@@ -229,6 +229,19 @@ def _learned_word(video: VideoModel) -> nn.Parameter:
     table = embedding_weight(video.components.text_encoder)
     start = table[identity_token_id(video.components.tokenizer)].detach().clone().float()
     return nn.Parameter(start)
+
+
+@contextmanager
+def _checkpointed(video: VideoModel) -> Iterator[None]:
+    """Within the block a published model's blocks compute their activations anew for the gradient, to fit a GPU."""
+    large = [] if video.reads_bodies else experts(video)
+    for network in large:
+        network.enable_gradient_checkpointing()
+    try:
+        yield
+    finally:
+        for network in large:
+            network.disable_gradient_checkpointing()
 
 
 @contextmanager

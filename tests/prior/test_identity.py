@@ -108,6 +108,28 @@ def test_a_borrowed_model_is_given_back_as_it_was(form: str, folders: dict[str, 
     assert torch.equal(velocity(video, channels, 0.3), before[1])
 
 
+def test_activations_computed_anew_change_no_loss(
+    wan_folders: dict[str, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from diffusers import WanTransformer3DModel as Network
+
+    losses, switched = [], []
+    enable = Network.enable_gradient_checkpointing
+    for wanted in (True, False):
+
+        def counted(network: Network, wanted: bool = wanted) -> None:
+            switched.append(wanted)
+            if wanted:
+                enable(network)
+
+        monkeypatch.setattr(Network, "enable_gradient_checkpointing", counted)
+        video = load_video(wan_folders["5b"])
+        losses.append(train_identity(video, frames(), IdentityConfig(rank=2, steps=3, batch=2)).losses)
+        assert not experts(video)[0].is_gradient_checkpointing
+    assert switched == [True, False]
+    torch.testing.assert_close(losses[0], losses[1], rtol=1e-5, atol=0)
+
+
 def test_half_precision_weights_are_updated_in_float32(wan_folders: dict[str, Path]) -> None:
     video = load_video(wan_folders["5b"], torch.bfloat16)
     train_identity(video, frames(), IdentityConfig(rank=2, steps=2, batch=2))
