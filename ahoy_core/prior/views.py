@@ -61,16 +61,13 @@ class PriorBody:
             ValueError: for another size than that of the canonical views.
         """
         seeded = replace(self, config=self.config.model_copy(update={"seed": seed}))
+        self._check(image, mask)
         silhouette = self.pictures.mask[0]
         return seeded._with_front(image, silhouette, silhouette * (1 - mask)).completed()[0]
 
     def _with_front(self, image: Tensor, silhouette: Tensor, observed: Tensor) -> PriorBody:
+        self._check(image, observed)
         given = self.pictures
-        if image.shape != given.frames.shape[1:] or observed.shape != given.mask.shape[1:]:
-            raise ValueError(
-                f"expected image {tuple(given.frames.shape[1:])} and mask of the canonical views' size, got "
-                f"{tuple(image.shape)} and {tuple(observed.shape)}; render them with the same camera"
-            )
         # What the given front leaves open keeps the coarse fill as the prior's first guess.
         front = image * observed + given.frames[0] * (1 - observed)
         pictures = Pictures(
@@ -80,3 +77,11 @@ class PriorBody:
             moving=False,
         )
         return replace(self, pictures=pictures)
+
+    def _check(self, image: Tensor, mask: Tensor) -> None:
+        given = self.pictures
+        if image.shape != given.frames.shape[1:] or mask.shape != given.mask.shape[1:]:
+            raise ValueError(
+                f"expected image {tuple(given.frames.shape[1:])} and mask of the canonical views' size, got "
+                f"{tuple(image.shape)} and {tuple(mask.shape)}; render them with the same camera"
+            )
