@@ -46,6 +46,7 @@ class PriorBody:
         Raises:
             ValueError: for another size than that of the canonical views.
         """
+        self._check(image, mask)
         return self._with_front(image, mask, mask).completed(), AZIMUTHS
 
     def inpaint(self, image: Tensor, mask: Tensor, prompt: str = "", seed: int = 0) -> Tensor:
@@ -66,7 +67,6 @@ class PriorBody:
         return seeded._with_front(image, silhouette, silhouette * (1 - mask)).completed()[0]
 
     def _with_front(self, image: Tensor, silhouette: Tensor, observed: Tensor) -> PriorBody:
-        self._check(image, observed)
         given = self.pictures
         # What the given front leaves open keeps the coarse fill as the prior's first guess.
         front = image * observed + given.frames[0] * (1 - observed)
