@@ -51,6 +51,7 @@ def chosen(folder: Path) -> Fills:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(900)  # ten models' libraries are imported, and every stage runs
 def test_every_role_filled_by_its_production_adapter(
     models: None, demo_clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
