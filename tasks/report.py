@@ -88,7 +88,8 @@ def _content(ctx: StageContext) -> dict[str, Any]:
     summaries = {name: manifest.summary for name, manifest in ctx.manifests.items()}
     bills = [{"stage": name, **summary["bill"]} for name, summary in summaries.items()]
     total = sum(bill["wall_s"] for bill in bills)
-    roles = {role: {"role": role, **who} for manifest in ctx.manifests.values() for role, who in manifest.roles.items()}
+    filled = [(role, who) for manifest in ctx.manifests.values() for role, who in manifest.roles.items()]
+    roles = {(role, who["name"]): {"role": role, **who} for role, who in filled}  # stages may differ in who fills one
     return {
         "version": version("ahoy-avatars"),
         "title": f"Avatar from video {ctx.manifests['ingest'].inputs['source'][:8]}",
