@@ -72,7 +72,9 @@ def roles() -> None:
     table = Table("role", "fill", "model", "licence", "commercial use", "weights", "extra")
     for each in ADAPTERS:
         size = f"{each.weights_gib():.1f} GiB {each.dtype}" if each.parameters else ""
-        table.add_row(each.role, each.name, each.title, each.licence, each.commercial, size, each.extra or "")
+        # Escaped: "FLUX.1 Fill [dev]" would lose its last word, as the name of a style.
+        words = (each.role, each.name, each.title, each.licence, each.commercial, size, each.extra or "")
+        table.add_row(*map(escape, words))
     console.print(table)
     console.print(
         f"every role is filled by {EMBEDDED} unless roles.yaml says otherwise; docs/models.md", soft_wrap=True
@@ -86,6 +88,9 @@ def check(
     trust_code: Annotated[
         bool, typer.Option("--trust-code", help="the TorchScript file is a program and may be run")
     ] = False,
+    own_weights: Annotated[
+        bool, typer.Option("--own-weights", help="the weights are your own: do not compare published hashes")
+    ] = False,
     device: Annotated[str, typer.Option(help="cpu, cuda, cuda:1; auto is cuda where there is one")] = "auto",
 ) -> None:
     """Load what is to fill a role, run one tiny input through it, and print shapes, time and memory."""
@@ -95,17 +100,19 @@ def check(
         from tasks.model_check import parse
 
         fills = read_fills(roles.read_text(encoding="utf-8")) if roles else read_fills("")
-        declared, fill = parse(what, trust_code, fills.chosen)
+        declared, fill = parse(what, trust_code, own_weights, fills.chosen)
         found = run_check(declared, fill if device == "auto" else fill.model_copy(update={"device": device}))
     except (ModelError, OSError, ValueError) as error:
         console.print("[red]error:[/]", escape(str(error)), highlight=False, soft_wrap=True)
         raise typer.Exit(EXIT_BAD_MODEL) from None
-    console.print(f"{declared.label}: {declared.title} on {found.device}", soft_wrap=True)
-    console.print(f"licence: {declared.licence} ({declared.licence_at})", soft_wrap=True, highlight=False)
-    for name, shape in found.shapes.items():
-        console.print(f"{name:<10} {shape}", markup=False, highlight=False)
+    console.print(f"{declared.label}: {declared.title} on {found.device}", soft_wrap=True, markup=False)
+    console.print(f"licence: {declared.licence} ({declared.licence_at})", soft_wrap=True, highlight=False, markup=False)
+    for name, words in {**found.hashes, **found.shapes}.items():
+        console.print(f"{name:<10} {words}", markup=False, highlight=False, soft_wrap=True)
     console.print(
-        f"loaded in {found.load_s:.2f} CPU-s, ran in {found.run_s:.2f} CPU-s, peak {found.memory_mib:.0f} MiB"
+        f"loaded in {found.load.wall_s:.2f} s ({found.load.cpu_s:.2f} CPU-s), "
+        f"ran in {found.run.wall_s:.2f} s ({found.run.cpu_s:.2f} CPU-s), peak {found.memory_mib:.0f} MiB",
+        soft_wrap=True,
     )
 
 

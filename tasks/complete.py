@@ -12,7 +12,8 @@ import numpy as np
 import torch
 from pydantic import BaseModel, ConfigDict, Field
 
-from ahoy_core.body.packaged import PackagedBody, load_packaged_body
+from ahoy_core.body.load import load_body
+from ahoy_core.body.model import BodyModel
 from ahoy_core.formats.images import contact_sheet, to_uint8, write_png
 from ahoy_core.formats.npz import load_npz, save_npz
 from ahoy_core.texture.atlas import ObservedAtlas
@@ -20,7 +21,7 @@ from ahoy_core.texture.canonical import canonical_views
 from ahoy_core.texture.surface import Surface
 from ahoy_core.texture.texels import texel_map
 from ahoy_core.texture.texture import canonical_vertices
-from tasks.prior_folder import no_prior, prior_folder
+from tasks.prior_folder import no_prior, open_prior
 from tasks.roles import ours, packaged_body
 from tasks.stage import Role, Run, Stage, StageContext, StageOutput
 
@@ -43,15 +44,14 @@ def run_complete(config: CompleteConfig, ctx: StageContext) -> StageOutput:
     """Let the fills compete; with the symmetric fill the winner, the texture is handed on byte by byte."""
     from ahoy_core.prior.canonical import CanonicalFill, check_prior
     from ahoy_core.prior.selfcheck import BASELINE
-    from ahoy_core.prior.video import load_video
 
-    body, atlas = load_packaged_body(), load_npz(ctx.inputs["texture"] / "atlas.npz")
+    body, atlas = load_body(ctx.body), load_npz(ctx.inputs["texture"] / "atlas.npz")
     betas = load_npz(ctx.inputs["perceive"] / "body.npz", ["betas"])["betas"]
     observed = ObservedAtlas(atlas["observed_rgb"], atlas["coverage"], atlas["source_frame"])
-    video = load_video(prior_folder(ctx.prior))
-    fill = CanonicalFill(body, betas, observed)
+    video = open_prior(ctx.prior, ctx.fills)
+    fill = CanonicalFill(body, betas, observed, video.size)
     check = check_prior(video, fill, config.seed, config.regions)
-    winner = check.winner if config.believe == "winner" else _best_prior(check.errors)
+    winner = check.winner if config.believe == "winner" else _best_prior(video, check.errors)
     used = winner != BASELINE
     if used:
         _recolour(video, winner, config.seed, fill, atlas, (body, betas, observed), ctx)
@@ -71,10 +71,10 @@ def run_complete(config: CompleteConfig, ctx: StageContext) -> StageOutput:
     return StageOutput(_summary(found), ("completed.png",) if used else ())
 
 
-def _best_prior(errors: Mapping[str, float]) -> str:
-    from ahoy_core.prior.canonical import CLEAN_UP, INVERSION
+def _best_prior(video: Any, errors: Mapping[str, float]) -> str:
+    from ahoy_core.prior.canonical import ways
 
-    return min((CLEAN_UP, INVERSION), key=lambda name: errors.get(name, 0.0))
+    return min(ways(video), key=lambda name: errors.get(name, 0.0))
 
 
 def _recolour(
@@ -83,7 +83,7 @@ def _recolour(
     seed: int,
     fill: Any,
     atlas: Mapping[str, np.ndarray],
-    person: tuple[PackagedBody, np.ndarray, ObservedAtlas],
+    person: tuple[BodyModel, np.ndarray, ObservedAtlas],
     ctx: StageContext,
 ) -> None:
     from ahoy_core.prior.config import PriorConfig
@@ -106,10 +106,10 @@ def _recolour(
 
 
 def method_of(winner: str) -> Any:
-    """The method of `PriorConfig` that a competitor of the self-check stands for."""
-    from ahoy_core.prior.canonical import INVERSION
+    """The method of `PriorConfig` that a competitor of the self-check stands for; the clean-up for the baseline."""
+    from ahoy_core.prior.canonical import METHODS
 
-    return "inversion" if winner == INVERSION else "clean-up"
+    return METHODS.get(winner, "clean-up")
 
 
 def _draw(before: np.ndarray, after: np.ndarray, path: Path) -> None:
@@ -133,12 +133,12 @@ def _summary(found: Mapping[str, Any]) -> dict[str, Any]:
 
 def obstacle(run: Run, summaries: Mapping[str, Mapping[str, Any]]) -> str:
     """Why this run cannot ask a prior."""
-    return no_prior(run.prior, run.body)
+    return no_prior(run.prior, run.body, run.fills)
 
 
 def lost(run: Run, summaries: Mapping[str, Mapping[str, Any]]) -> str:
     """Why a later stage need not ask the prior: on this video's own evidence the symmetric fill was closer."""
-    if reason := no_prior(run.prior, run.body):
+    if reason := no_prior(run.prior, run.body, run.fills):
         return reason
     found = summaries["complete"]
     if found["prior_used"]:
@@ -155,4 +155,13 @@ def _roles(config: CompleteConfig) -> Mapping[str, Role]:
     }
 
 
-COMPLETE = Stage("complete", 1, CompleteConfig, ("perceive", "texture"), run_complete, _roles, obstacle=obstacle)
+COMPLETE = Stage(
+    "complete",
+    1,
+    CompleteConfig,
+    ("perceive", "texture"),
+    run_complete,
+    _roles,
+    obstacle=obstacle,
+    fillable=("video",),
+)

@@ -20,10 +20,11 @@ import yaml
 from pydantic import TypeAdapter, ValidationError
 
 from ahoy_core.body.load import PACKAGED
-from ahoy_core.models.adapter import Fill
+from ahoy_core.models.adapter import OWN_WEIGHTS, Fill
 from ahoy_core.models.catalogue import adapter, check_fills
 from ahoy_core.models.checkpoint import device_of
 from ahoy_core.models.errors import ModelError
+from ahoy_core.models.hashes import sha256_of
 from tasks.role import Role
 
 ENVIRONMENT: Final = "AHOY_ROLES"
@@ -49,7 +50,7 @@ class Fills:
         if role not in self.chosen:
             return None
         fill = self.chosen[role]
-        return _opened(role, fill.model_dump_json(), _weights_hash(fill))
+        return _opened(role, fill.model_dump_json(), _weights_hash(fill, adapter(role, fill.fill).companions(fill)))
 
     def role(self, role: str) -> Role | None:
         """Who fills a role, for keys, reports and metric rows; None for the embedded default.
@@ -62,7 +63,8 @@ class Fills:
         fill = self.chosen[role]
         declared = adapter(role, fill.fill)
         declared.require(fill)
-        return Role(declared.title, declared.licence, _identity(fill))
+        title = declared.title + (OWN_WEIGHTS if fill.own_weights else "")
+        return Role(title, declared.licence, _identity(fill, declared.companions(fill)))
 
     def filled(self, defaults: Mapping[str, Role], fillable: tuple[str, ...]) -> dict[str, Role]:
         """A stage's roles, with those that are filled otherwise replaced or added."""
@@ -91,11 +93,16 @@ class Fills:
     def preload(self) -> list[str]:
         """Load the models that work on the CPU, for a process that others are forked from; returns their roles.
 
-        A GPU's context does not survive a fork, so its models are loaded by each fork, out of the page cache.
+        A GPU's context does not survive a fork, so its models are loaded elsewhere; but their files are hashed here
+        once, for all forks.
+
+        Raises:
+            ModelError: one cannot be loaded, or its files are not there.
         """
         roles = [role for role, fill in self.chosen.items() if not fill.command and fill.device == "cpu"]
         for role in roles:
             self.get(role)
+        self.filled({}, tuple(self.chosen))
         return roles
 
     def to_json(self) -> str:
@@ -161,26 +168,22 @@ def _opened(role: str, said: str, weights: str) -> Any:
     return adapter(role, fill.fill).open(fill)
 
 
-def _identity(fill: Fill) -> str:
+def _identity(fill: Fill, companions: list[Path]) -> str:
     """What a key knows of a fill: its files' contents, its knobs and its command, never a path or a device."""
-    parts = (fill.fill, fill.dtype or "", json.dumps(fill.options, sort_keys=True), *fill.command, _weights_hash(fill))
+    weights = _weights_hash(fill, companions)
+    parts = (fill.fill, fill.dtype or "", json.dumps(fill.options, sort_keys=True), *fill.command, weights)
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()
 
 
-def _weights_hash(fill: Fill) -> str:
+def _weights_hash(fill: Fill, companions: list[Path]) -> str:
+    """Sha256 over names and contents of all files at the path, and of those that are used beside it."""
     if fill.path is None:
         return ""
     files = sorted(p for p in fill.path.rglob("*") if p.is_file()) if fill.path.is_dir() else [fill.path]
+    if not fill.path.is_dir():
+        files += companions
     root = fill.path if fill.path.is_dir() else fill.path.parent
-    versions = tuple((str(f), str(f.relative_to(root)), f.stat().st_size, f.stat().st_mtime_ns) for f in files)
-    return _hash_of(versions)
-
-
-@lru_cache(maxsize=64)
-def _hash_of(versions: tuple[tuple[str, str, int, int], ...]) -> str:
-    """Sha256 over names and contents, read once a process for each version of the files."""
     total = hashlib.sha256()
-    for path, name, _, _ in versions:
-        with Path(path).open("rb") as file:
-            total.update(f"{name}\0{hashlib.file_digest(file, 'sha256').hexdigest()}\n".encode())
+    for file in files:
+        total.update(f"{file.relative_to(root)}\0{sha256_of(file)}\n".encode())
     return total.hexdigest()

@@ -13,14 +13,14 @@ from torch import Tensor
 
 from ahoy_core.avatar.files import load_avatar
 from ahoy_core.avatar.hallucinated import Supervision
-from ahoy_core.body.packaged import load_packaged_body
+from ahoy_core.body.load import load_body
 from ahoy_core.conventions import Cameras
 from ahoy_core.formats.images import contact_sheet, to_float, to_uint8, write_png
 from ahoy_core.formats.npz import load_npz, save_npz
 from ahoy_core.prior.config import InversionConfig, PriorConfig
 from tasks.complete import lost, method_of
 from tasks.motions import read_sequence
-from tasks.prior_folder import prior_folder
+from tasks.prior_folder import open_prior
 from tasks.roles import ours, packaged_body
 from tasks.stage import Role, Stage, StageContext, StageOutput
 
@@ -48,18 +48,17 @@ def run_hallucinate(config: HallucinateConfig, ctx: StageContext) -> StageOutput
         sequence_context,
         silhouette_iou,
     )
-    from ahoy_core.prior.identity import load_identity
+    from ahoy_core.prior.identity import borrowed, load_identity
     from ahoy_core.prior.text import IDENTITY_PROMPT
-    from ahoy_core.prior.video import load_video
 
     sequence = read_sequence(ctx.inputs["motions"], ctx.item)
-    avatar, body = load_avatar(ctx.inputs["coarse"]), load_packaged_body()
-    video = load_video(prior_folder(ctx.prior))
-    load_identity(video, ctx.inputs["identity"])
-    pictures = coarse_pictures(avatar, body, sequence)
+    avatar, body = load_avatar(ctx.inputs["coarse"]), load_body(ctx.body)
     maps, azimuth = sequence_context(body, avatar.betas, sequence)
     asked = _asked(config, ctx.inputs["complete"])
-    made = repaint(video, pictures, maps, azimuth, asked, IDENTITY_PROMPT)
+    with borrowed(open_prior(ctx.prior, ctx.fills)) as video:
+        load_identity(video, ctx.inputs["identity"])
+        pictures = coarse_pictures(avatar, body, sequence, video.size)
+        made = repaint(video, pictures, maps, azimuth, asked, IDENTITY_PROMPT)
     frames = composited(made, pictures)
     supervision = as_supervision(sequence, frames, pictures)
     _save(supervision, ctx.out)
@@ -152,4 +151,5 @@ HALLUCINATE = Stage(
     _roles,
     over="motions",
     obstacle=lost,
+    fillable=("video",),
 )

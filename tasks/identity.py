@@ -14,14 +14,14 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from ahoy_core.body.packaged import load_packaged_body
+from ahoy_core.body.load import load_body
 from ahoy_core.body.rotations import axis_angle_to_matrix
 from ahoy_core.conventions import Cameras
 from ahoy_core.formats.images import contact_sheet, to_float, to_uint8, write_png
 from ahoy_core.formats.npz import load_npz
 from ahoy_core.prior.config import IdentityConfig
 from tasks.complete import lost
-from tasks.prior_folder import prior_folder
+from tasks.prior_folder import open_prior
 from tasks.roles import ours, packaged_body
 from tasks.stage import Role, Stage, StageContext, StageOutput
 
@@ -38,16 +38,15 @@ class IdentityStageConfig(IdentityConfig):
 def run_identity(config: IdentityStageConfig, ctx: StageContext) -> StageOutput:
     """Fine-tune, save in diffusers' LoRA format, and show the subject as the prior draws it before and after."""
     from ahoy_core.prior.corpus.prompts import NEUTRAL
-    from ahoy_core.prior.identity import save_identity, train_identity
+    from ahoy_core.prior.identity import borrowed, save_identity, train_identity
     from ahoy_core.prior.text import IDENTITY_PROMPT
-    from ahoy_core.prior.video import load_video
 
-    frames = subject(ctx.inputs["ingest"], ctx.inputs["perceive"], config.frames)
-    video = load_video(prior_folder(ctx.prior))
-    before = drawn(video, frames, NEUTRAL, config.seed)
-    losses = train_identity(video, frames, config, lambda done: ctx.progress(done, config.steps, "steps")).losses
-    after = drawn(video, frames, IDENTITY_PROMPT, config.seed)
-    save_identity(video, ctx.out)
+    with borrowed(open_prior(ctx.prior, ctx.fills)) as video:
+        frames = subject(ctx, config.frames, video.size)
+        before = drawn(video, frames, NEUTRAL, config.seed)
+        losses = train_identity(video, frames, config, lambda done: ctx.progress(done, config.steps, "steps")).losses
+        after = drawn(video, frames, IDENTITY_PROMPT, config.seed)
+        save_identity(video, ctx.out)
     table = {"step": list(range(1, len(losses) + 1)), "loss": losses.tolist()}
     pq.write_table(pa.table(table), ctx.out / "losses.parquet")
     _plot(losses.numpy(), ctx.out / "losses.png")
@@ -60,20 +59,21 @@ def run_identity(config: IdentityStageConfig, ctx: StageContext) -> StageOutput:
     return StageOutput({"facts": facts, "colour_errors": errors}, ("before_after.png", "losses.png"))
 
 
-def subject(ingest: Path, perceive: Path, count: int) -> Any:
-    """The subject's person images (`ahoy_core.prior.identity.Frames`), from two artifact folders.
+def subject(ctx: StageContext, count: int, size: tuple[int, int]) -> Any:
+    """The subject's person images (`ahoy_core.prior.identity.Frames`).
 
     Args:
-        ingest: of the frames.
-        perceive: of fit and masks.
+        ctx: with the artifacts `ingest` (frames) and `perceive` (fit and masks).
         count: at most.
+        size: height and width of the images, pixels.
     """
     from ahoy_core.prior.subject import subject_frames
 
+    ingest, perceive = ctx.inputs["ingest"], ctx.inputs["perceive"]
     fit = {name: torch.from_numpy(value) for name, value in load_npz(perceive / "body.npz", list(_FIT_ARRAYS)).items()}
     usable = torch.nonzero(fit["used"]).flatten()
     rows = usable[torch.linspace(0, len(usable) - 1, min(count, len(usable))).round().long()]
-    body, number = load_packaged_body(), len(rows)
+    body, number = load_body(ctx.body), len(rows)
     images = to_float(load_npz(ingest / "frames.npz", ["frames"])["frames"][rows.numpy()])
     masks = torch.from_numpy(load_npz(perceive / "masks.npz", ["visible"])["visible"][rows.numpy()]).float() / 255
     with torch.no_grad():
@@ -82,7 +82,7 @@ def subject(ingest: Path, perceive: Path, count: int) -> Any:
         fit["viewmat"].expand(number, 4, 4), fit["K"].expand(number, 3, 3), images.shape[-1], images.shape[-2]
     )
     roots = axis_angle_to_matrix(fit["pose"][rows, 0])
-    return subject_frames(images, masks[:, None], cameras, body, posed.vertices, roots)
+    return subject_frames(images, masks[:, None], cameras, body, posed.vertices, roots, size)
 
 
 @torch.no_grad()
@@ -139,5 +139,12 @@ def _roles(config: IdentityStageConfig) -> Mapping[str, Role]:
 
 
 IDENTITY = Stage(
-    "identity", 1, IdentityStageConfig, ("ingest", "perceive", "complete"), run_identity, _roles, obstacle=lost
+    "identity",
+    1,
+    IdentityStageConfig,
+    ("ingest", "perceive", "complete"),
+    run_identity,
+    _roles,
+    obstacle=lost,
+    fillable=("video",),
 )

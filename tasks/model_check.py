@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import resource
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ import torch
 from torch import Tensor
 
 from ahoy_core.conventions import Cameras, look_at, orbit_eyes, perspective_K
+from ahoy_core.cost.meter import Bill, Meter
 from ahoy_core.models.adapter import Adapter, Fill
 from ahoy_core.models.catalogue import ADAPTERS, adapter
 from ahoy_core.models.checkpoint import device_of
@@ -29,26 +29,32 @@ class Checked:
     Attributes:
         adapter: what was loaded.
         device: where it ran.
+        hashes: of its files, by name, and whether they are the published ones.
         shapes: of what came back, by name.
-        load_s: CPU seconds to load it.
-        run_s: CPU seconds (a GPU's are waited for) of the one call.
+        load: what it cost to load it.
+        run: what the one call cost; a GPU is waited for.
         memory_mib: of the GPU at its peak; of this process where there is none.
     """
 
     adapter: Adapter
     device: str
+    hashes: Mapping[str, str]
     shapes: Mapping[str, str]
-    load_s: float
-    run_s: float
+    load: Bill
+    run: Bill
     memory_mib: float
 
 
-def parse(text: str, trust_code: bool, fills: Mapping[str, Fill]) -> tuple[Adapter, Fill]:
+def parse(text: str, trust_code: bool, own_weights: bool, fills: Mapping[str, Fill]) -> tuple[Adapter, Fill]:
     """`ROLE=FILL:PATH`, `ROLE=PATH` where one adapter's files are at the path, or `ROLE` from `roles.yaml`.
 
     Raises:
         ModelError: of another form, an unknown name, or a path at which no adapter's files are.
     """
+
+    def fill(name: str, path: Path | None) -> Fill:
+        return Fill(fill=name, path=path, trust_code=trust_code, own_weights=own_weights)
+
     role, equals, rest = text.partition("=")
     if not equals:
         if role not in fills:
@@ -59,9 +65,9 @@ def parse(text: str, trust_code: bool, fills: Mapping[str, Fill]) -> tuple[Adapt
     if not known or (colon and name in known) or rest in known:
         declared = adapter(role, name)
         given = fills.get(role) if declared.is_command else None
-        return declared, given or Fill(fill=name, path=Path(path) if path else None, trust_code=trust_code)
+        return declared, given or fill(name, Path(path) if path else None)
     declared = recognised(role, Path(rest))
-    return declared, Fill(fill=declared.name, path=Path(rest), trust_code=trust_code)
+    return declared, fill(declared.name, Path(rest))
 
 
 def recognised(role: str, path: Path) -> Adapter:
@@ -87,19 +93,19 @@ def check(declared: Adapter, fill: Fill) -> Checked:
     device = device_of(fill)
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
-    start = time.process_time()
-    model = declared.open(fill)
-    loaded = time.process_time()
-    with torch.no_grad():
+    with Meter() as loading:
+        model = declared.open(fill)
+    with Meter() as running, torch.no_grad():
         answer = PROBES[declared.role](model)
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
+        if device.type == "cuda":
+            torch.cuda.synchronize(device)
     return Checked(
         declared,
         str(device),
+        declared.hashes(fill),
         {name: _described(value) for name, value in answer.items()},
-        loaded - start,
-        time.process_time() - loaded,
+        loading.read(),
+        running.read(),
         _peak_mib(device),
     )
 

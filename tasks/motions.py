@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from pydantic import BaseModel, ConfigDict, Field
 
-from ahoy_core.body.packaged import load_packaged_body
+from ahoy_core.body.load import load_body
 from ahoy_core.conventions import Cameras
 from ahoy_core.formats.npz import load_npz, save_npz
 from ahoy_core.prior.framing import HEIGHT, WIDTH
@@ -34,7 +34,7 @@ class MotionsConfig(BaseModel):
 
 def run_motions(config: MotionsConfig, ctx: StageContext) -> StageOutput:
     """Plan, and say of every motion why it is there or not."""
-    body = load_packaged_body()
+    body = load_body(ctx.body)
     atlas = load_npz(ctx.inputs["texture"] / "atlas.npz", ["coverage"])["coverage"]
     betas = torch.from_numpy(load_npz(ctx.inputs["perceive"] / "body.npz", ["betas"])["betas"]).float()
     surface = Surface.of(body)

@@ -8,8 +8,10 @@ from functools import cache
 from importlib import resources
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 from ahoy_core.body.load import PACKAGED
+from tasks.fills import Fills
 from tasks.role import Role
 
 NONE = "none"
@@ -25,18 +27,44 @@ def prior_folder(source: str) -> Path:
     return Path(source).expanduser()
 
 
-def no_prior(source: str, body: str) -> str:
+def fills_prior(source: str, fills: Fills) -> bool:
+    """Whether `roles.yaml` says which video model a run asks: it does where the run's settings name none."""
+    return source == PACKAGED and "video" in fills.chosen
+
+
+def open_prior(source: str, fills: Fills) -> Any:
+    """The video model of a run: the one of `roles.yaml`, kept by this process, or a folder's, loaded anew.
+
+    Args:
+        source: `Settings.prior`.
+        fills: who fills the roles.
+
+    Raises:
+        ModelError: the filling cannot be loaded.
+        PriorFormatError: the folder holds no prior.
+    """
+    if fills_prior(source, fills):
+        return fills.get("video")
+    from ahoy_core.prior.video import load_video
+
+    return load_video(prior_folder(source))
+
+
+def no_prior(source: str, body: str, fills: Fills) -> str:
     """Why a run cannot ask a prior; empty where it can.
 
     Args:
         source: `Settings.prior`.
-        body: `Settings.body`.
+        body: name or file of the run's body.
+        fills: who fills the roles.
 
     Raises:
         FileNotFoundError: the user named a folder that holds no prior.
     """
     if source == NONE:
         return "switched off (prior=none)"
+    if fills_prior(source, fills):
+        return ""
     index = prior_folder(source) / _INDEX
     if not index.is_file():
         if source == PACKAGED:
@@ -44,9 +72,8 @@ def no_prior(source: str, body: str) -> str:
         raise FileNotFoundError(f"expected a prior with {_INDEX} in {source!r}, got none; correct the knob `prior`")
     if missing := [name for name in _NEEDS if find_spec(name) is None]:
         return f"needs {', '.join(missing)}: pip install 'ahoy-avatars[prior]'"
-    if json.loads(index.read_text(encoding="utf-8")).get("vae", ["", ""])[1] != _EMBEDDED:
-        return "this prior reads no bodies (Wan as published): the library runs it, the stages do not yet"
-    if body != PACKAGED:
+    reads_bodies = json.loads(index.read_text(encoding="utf-8")).get("vae", ["", ""])[1] == _EMBEDDED
+    if reads_bodies and body != PACKAGED:
         return "the prior knows the packaged body alone, and this run has another"
     return ""
 

@@ -94,7 +94,8 @@ def _content(ctx: StageContext) -> dict[str, Any]:
     bill = run_bill(ctx, packaged_set())
     total = sum(row.wall_s for row in bill.rows)
     predicted = [row.predicted_s for row in bill.rows if row.predicted_s is not None]
-    roles = {role: {"role": role, **who} for manifest in ctx.manifests.values() for role, who in manifest.roles.items()}
+    filled = [(role, who) for manifest in ctx.manifests.values() for role, who in manifest.roles.items()]
+    roles = {(role, who["name"]): {"role": role, **who} for role, who in filled}  # stages may differ in who fills one
     return {
         "version": version("ahoy-avatars"),
         "title": f"Avatar from video {ctx.manifests['ingest'].inputs['source'][:8]}",

@@ -20,7 +20,7 @@ from ahoy_core.cost.meter import Bill, Meter
 from storage_schema.keys import stage_key
 from storage_schema.store import ArtifactStore, Manifest
 from tasks.errors import message_of
-from tasks.prior_folder import prior_role
+from tasks.prior_folder import fills_prior, prior_role
 from tasks.role import Role
 from tasks.roles import body_role
 from tasks.stage import Run, Source, Stage, StageContext, StageOutput, StageRef
@@ -77,7 +77,7 @@ def filled_by(stage: Stage, config: BaseModel, run: Run) -> dict[str, Role]:
     filled_by = run.fills.filled(stage.roles(config), stage.fillable)
     if "body" in filled_by:
         filled_by["body"] = body_role(run.body)
-    if "video" in filled_by:
+    if "video" in filled_by and not fills_prior(run.prior, run.fills):
         filled_by["video"] = prior_role(run.prior)
     return filled_by
 

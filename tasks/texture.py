@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ import numpy as np
 from ahoy_core.body.load import load_body
 from ahoy_core.formats.images import contact_sheet, write_png
 from ahoy_core.formats.npz import load_npz, save_npz
-from ahoy_core.texture.by_roles import agreement, complete_by, parts_by
+from ahoy_core.texture.by_roles import charts_on, complete_by, dense_by
 from ahoy_core.texture.surface import Surface
 from ahoy_core.texture.texture import Texture, TextureConfig, build_texture
 from tasks.roles import ours, packaged_body
@@ -28,14 +29,18 @@ def run_texture(config: TextureConfig, ctx: StageContext) -> StageOutput:
     masks = load_npz(ctx.inputs["perceive"] / "masks.npz", ["visible", "box"])
     fit = load_npz(ctx.inputs["perceive"] / "body.npz")
     body = load_body(ctx.body)
-    more: dict[str, Any] = {}
-    if (dense := ctx.fills.get("surface")) is not None:
-        more["checked"] = agreement(Surface.of(body), parts_by(dense, frames, masks["box"], fit["used"]))
+    dense = None
+    if (role := ctx.fills.get("surface")) is not None:
+        surface = Surface.of(body)
+        dense = dense_by(role, surface, frames, masks["box"], fit["used"], charts_on(role, body, surface))
 
     def report(done: int, total: int) -> None:
         ctx.progress(done, total, "frames")
 
-    texture = build_texture(frames, masks["visible"], fit, body, config, report, **more)
+    texture = build_texture(frames, masks["visible"], fit, body, config, report, second=dense)
+    if dense is not None and dense.charts is not None:
+        moved = {str(t): round(pixels, 2) for t, pixels in sorted(dense.moved.items())}
+        texture = replace(texture, notes={**texture.notes, "moved_by_charts_px": moved})
     texture = complete_by(texture, ctx.fills.get("inpaint"), ctx.fills.get("views"))
     save_npz(ctx.out / "atlas.npz", texture.atlas_arrays(), compress=True)
     save_npz(ctx.out / "canonical.npz", texture.canonical_arrays(), compress=True)
@@ -54,6 +59,9 @@ def _summary(texture: Texture, total: int) -> dict[str, Any]:
         "fill": notes["fill"],
         "frames that wrote": f"{len(notes['frames_used'])} of {total}",
     }
+    if (moved := notes.get("moved_by_charts_px")) is not None:
+        mean = sum(moved.values()) / max(len(moved), 1)
+        facts["moved to DensePose's charts"] = f"{len(moved)} frames, by {mean:.1f} pixels on average"
     rejected = [f"frame {frame} not used: {why}" for frame, why in list(notes["frames_rejected"].items())[:SHOWN]]
     more = len(notes["frames_rejected"]) - len(rejected)
     return {

@@ -16,6 +16,9 @@ PACKAGED: Final = "packaged"
 # The makers' own names for files that belong to a model and are downloaded beside it.
 UV_FILES: Final = ("uv.obj", "smpl_uv.obj", "smplx_uv.obj")
 HEAD_FILES: Final = ("SMPL-X__FLAME_vertex_ids.npy",)
+FLAME_FILES: Final = ("FLAME_NEUTRAL.npz", "flame2023.npz", "generic_model.npz")
+FLAME_EXPRESSIONS: Final = 50
+"""Of FLAME's 100 components: what trackers of faces usually fit."""
 
 
 def load_body(source: str = PACKAGED, device: torch.device | str = "cpu") -> BodyModel:
@@ -23,7 +26,7 @@ def load_body(source: str = PACKAGED, device: torch.device | str = "cpu") -> Bod
 
     Args:
         source: "packaged", or the path of an SMPL, SMPL+H or SMPL-X `.npz`. Beside the latter, a texture layout
-            (`UV_FILES`) and the head's vertex numbers (`HEAD_FILES`) are used if they are there.
+            (`UV_FILES`), the head's vertex numbers (`HEAD_FILES`) and FLAME (`FLAME_FILES`) are used if they are there.
         device: where the tensors go.
 
     Raises:
@@ -51,7 +54,7 @@ def body_files(source: str) -> tuple[Path, ...]:
     return (path, *(other for other in found if other is not None))
 
 
-_BESIDE: Final = (UV_FILES, HEAD_FILES)
+_BESIDE: Final = (UV_FILES, HEAD_FILES, FLAME_FILES)
 
 
 @lru_cache(maxsize=2)
@@ -59,4 +62,8 @@ def _load_licensed(versions: tuple[tuple[Path, int], ...], device: str) -> BodyM
     path, *beside = (path for path, _ in versions)
     uv = next((other for other in beside if other.name in UV_FILES), None)
     head = next((other for other in beside if other.name in HEAD_FILES), None)
-    return load_smpl(path, uv=uv, head_ids=head, device=device)
+    flame = next((other for other in beside if other.name in FLAME_FILES), None)
+    if flame is None:
+        return load_smpl(path, uv=uv, head_ids=head, device=device)
+    count = FLAME_EXPRESSIONS
+    return load_smpl(path, uv=uv, head_ids=head, flame=flame, n_expressions=count, device=device)

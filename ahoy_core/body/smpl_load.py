@@ -18,7 +18,8 @@ from ahoy_core.body.lbs import normalize_weights
 from ahoy_core.body.smpl import HAND_JOINTS, SmplBody
 from ahoy_core.body.smpl_names import JOINT_NAMES
 from ahoy_core.body.smpl_parts import find_landmarks, find_regions
-from ahoy_core.formats.smpl import SmplFile, read_obj_uv, read_smpl
+from ahoy_core.formats.errors import BodyFileError
+from ahoy_core.formats.smpl import FlameFile, SmplFile, read_flame, read_obj_uv, read_smpl
 
 # Our x, y, z are the file's x, -z, y.
 _AXIS: Final = (0, 2, 1)
@@ -32,6 +33,7 @@ def load_smpl(
     *,
     uv: str | Path | None = None,
     head_ids: str | Path | None = None,
+    flame: str | Path | None = None,
     n_betas: int = 10,
     n_expressions: int = 10,
     device: torch.device | str = "cpu",
@@ -44,6 +46,7 @@ def load_smpl(
         uv: a `.obj` with texture coordinates; the file's own by default (SMPL-X's has them, SMPL's does not).
         head_ids: a `.npy` of vertex numbers that make the head, such as the makers' `SMPL-X__FLAME_vertex_ids.npy`; by
             default the vertices that head, jaw and eyes move most.
+        flame: FLAME's `.npz`, whose expressions then stand for SMPL-X's own; needs `head_ids` of FLAME's vertices.
         n_betas: shape components to use, at most those of the file.
         n_expressions: expression components to use, likewise (0 for SMPL and SMPL+H).
         device: where the tensors go.
@@ -59,7 +62,26 @@ def load_smpl(
     file = read_smpl(path)
     texture = _texture(file, uv)
     head = None if head_ids is None else np.load(head_ids, allow_pickle=False).astype(np.int64).ravel()
+    if flame is not None:
+        file = _with_flame(file, read_flame(flame), head, Path(flame).name)
     return _build(Path(path).stem.lower(), file, texture, head, n_betas, n_expressions).to(device, dtype)
+
+
+def _with_flame(file: SmplFile, flame: FlameFile, head: np.ndarray | None, name: str) -> SmplFile:
+    """SMPL-X with FLAME's expressions, which move the vertices that are FLAME's; its own shape components stay."""
+    count = len(flame.expressions)
+    if file.kind != "smplx" or head is None or len(head) != count:
+        given = "no list of them" if head is None else f"a list of {len(head)}"
+        raise BodyFileError(
+            f"expected SMPL-X and the numbers of its {count} vertices that are FLAME's for {name!r}, got {file.kind} "
+            f"and {given}; put SMPL-X__FLAME_vertex_ids.npy of the same makers beside the model"
+        )
+    shapes = file.arrays["shapedirs"]
+    own = _SHAPE_SPACE[shapes.shape[2] > _SHAPE_SPACE[True]]
+    joined = np.zeros((*shapes.shape[:2], _SHAPE_SPACE[True] + flame.expressions.shape[2]), shapes.dtype)
+    joined[:, :, :own] = shapes[:, :, :own]
+    joined[head, :, _SHAPE_SPACE[True] :] = flame.expressions
+    return SmplFile(file.kind, {**file.arrays, "shapedirs": joined}, file.parents)
 
 
 def _texture(file: SmplFile, uv: str | Path | None) -> tuple[np.ndarray, np.ndarray] | None:

@@ -21,6 +21,7 @@ from ahoy_core.formats.npz import load_npz, npz_names
 KIND_OF_JOINTS = {24: "smpl", 52: "smplh", 55: "smplx"}
 REQUIRED = ("v_template", "shapedirs", "posedirs", "J_regressor", "kintree_table", "weights", "f")
 HANDS = ("hands_meanl", "hands_meanr", "hands_componentsl", "hands_componentsr")
+FLAME_JOINTS, FLAME_SHAPES = 5, 300
 OPTIONAL = (*HANDS, "lmk_faces_idx", "lmk_bary_coords", "vt", "ft")
 CONVERT = (
     "a pickle runs whatever is written in it, so it is never opened here: take the .npz that the body's makers offer, "
@@ -68,6 +69,42 @@ def read_smpl(path: str | Path) -> SmplFile:
         ) from error
     kind = _check(source.name, arrays)
     return SmplFile(kind, arrays, _parents(source.name, arrays["kintree_table"]))
+
+
+@dataclass(frozen=True)
+class FlameFile:
+    """What a FLAME file gives to a body: its expressions.
+
+    Attributes:
+        expressions: [V,3,E] metres, in the file's axes (those of SMPL-X), for FLAME's V vertices.
+    """
+
+    expressions: NDArray[np.generic]
+
+
+def read_flame(path: str | Path) -> FlameFile:
+    """Read FLAME's `.npz`: `v_template` [V,3], `weights` [V,5], `shapedirs` [V,3,300+E], of which E are expressions.
+
+    Raises:
+        FileNotFoundError: no such file.
+        BodyFileError: a pickle, no `.npz`, or not FLAME; the text says what to do.
+    """
+    source = Path(path)
+    if source.suffix.lower() in (".pkl", ".pickle"):
+        raise BodyFileError(f"expected FLAME as .npz, got {source.name!r}: {CONVERT}")
+    try:
+        arrays = load_npz(source, ["v_template", "weights", "shapedirs"])
+    except NpzError as error:
+        raise BodyFileError(
+            f"expected FLAME's plain arrays in {source.name!r}, got: {error}; convert it as docs/models.md shows"
+        ) from error
+    vertices, shapes = len(arrays["v_template"]), arrays["shapedirs"].shape
+    if arrays["weights"].shape != (vertices, FLAME_JOINTS) or shapes[:2] != (vertices, 3) or shapes[2] <= FLAME_SHAPES:
+        raise BodyFileError(
+            f"expected FLAME's weights [V,{FLAME_JOINTS}] and shapedirs [V,3,more than {FLAME_SHAPES}] in "
+            f"{source.name!r}, got {arrays['weights'].shape} and {shapes}; give FLAME's own model file"
+        )
+    return FlameFile(arrays["shapedirs"][:, :, FLAME_SHAPES:])
 
 
 def _check(name: str, arrays: Mapping[str, NDArray[np.generic]]) -> str:

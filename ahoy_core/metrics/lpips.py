@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.nn.functional import max_pool2d, relu
 
 from ahoy_core.metrics.stlpips import MIN_SIDE, SCALE, SHIFT, check_pictures, weighted_difference
-from ahoy_core.models.adapter import Adapter, Fill
+from ahoy_core.models.adapter import OWN_WEIGHTS, Adapter, Fill
 from ahoy_core.models.checkpoint import device_of, read_state, take
 
 
@@ -73,11 +73,12 @@ class Lpips(nn.Module):
 
     Args:
         backbone: `ALEX` or `VGG`.
+        own_weights: they are not the published ones; the name says so.
     """
 
-    def __init__(self, backbone: Backbone) -> None:
+    def __init__(self, backbone: Backbone, own_weights: bool = False) -> None:
         super().__init__()
-        self.backbone = backbone
+        self.backbone, self.own_weights = backbone, own_weights
         self.stages = nn.ModuleList(
             nn.ModuleList(nn.Conv2d(c.before, c.after, c.kernel, c.stride, c.padding) for c in stage)
             for stage in backbone.stages
@@ -89,7 +90,7 @@ class Lpips(nn.Module):
     @property
     def name(self) -> str:
         """What its numbers are called."""
-        return self.backbone.title
+        return self.backbone.title + (OWN_WEIGHTS if self.own_weights else "")
 
     def forward(self, a: Tensor, b: Tensor) -> Tensor:
         """Distance of pictures a and b: [B], at least 0, 0 for equal ones.
@@ -140,7 +141,7 @@ def load_lpips(fill: Fill, adapter: Adapter, backbone: Backbone) -> Lpips:
         CheckpointError: a file is truncated or another network's; missing keys are named.
     """
     assert fill.path is not None
-    network = Lpips(backbone)
+    network = Lpips(backbone, fill.own_weights)
     body, heads = (fill.path / file.name for file in adapter.files)
     convs = {f"{c.name}.{part}": getattr(conv, part) for c, conv in _convs(network) for part in ("weight", "bias")}
     _fill(convs, body, adapter)

@@ -7,14 +7,17 @@ import importlib.util
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from ahoy_core.models.errors import CheckpointError, MissingPackageError, ModelError, UntrustedCodeError
+from ahoy_core.models.hashes import sha256_of
 
 DType = Literal["float32", "bfloat16", "float16"]
 DISTRIBUTION = "ahoy-avatars"
+OWN_WEIGHTS: Final = ", weights of the user's own"
+"""What is put after a model's name where its weights are not the published ones."""
 
 
 class Fill(BaseModel):
@@ -26,6 +29,8 @@ class Fill(BaseModel):
         device: "cpu", "cuda", "cuda:1"; "auto" is cuda where there is one.
         dtype: of the weights; by default the adapter's own. States of solvers and results stay float32.
         trust_code: the file at `path` is a program (TorchScript) and may be run.
+        own_weights: the files are not those that were published, and are not held against the published hashes; results
+            say so.
         command: an external command, as a list of words (no shell reads it).
         timeout_s: seconds that one call of the command may take.
         options: knobs of the adapter.
@@ -38,6 +43,7 @@ class Fill(BaseModel):
     device: str = Field(default="auto", pattern=r"^(auto|cpu|cuda(:\d+)?)$")
     dtype: DType | None = None
     trust_code: bool = False
+    own_weights: bool = False
     command: tuple[str, ...] = ()
     timeout_s: float = Field(default=3600.0, gt=0)
     options: dict[str, Any] = Field(default_factory=dict)
@@ -77,6 +83,7 @@ class Adapter:
         licence_at: where its text is.
         source: where its owner gets the files.
         files: what has to be there.
+        beside: what is used if it lies in the folder of the checkpoint's file; part of its hash.
         parameters: billions, as published; 0 where there are none or they are not published.
         dtype: of the weights by default.
         device: "cpu" where a CPU is enough, else "cuda".
@@ -105,6 +112,7 @@ class Adapter:
     endings: tuple[str, ...] = ()
     is_code: bool = False
     is_command: bool = False
+    beside: tuple[ExpectedFile, ...] = ()
 
     @property
     def label(self) -> str:
@@ -120,7 +128,7 @@ class Adapter:
 
         Raises:
             MissingPackageError: an optional package is missing.
-            CheckpointError: no path, or a file that is not there.
+            CheckpointError: no path, a file that is not there, or one of another hash than was published.
             UntrustedCodeError: the file is a program and nobody said that it may run.
             ModelError: a command is asked for and none is given.
         """
@@ -154,6 +162,36 @@ class Adapter:
         missing = [f.name for f in self.files if f.name and not any(_found(fill.path, f.name))]
         if missing:
             raise CheckpointError(f"{self.label}: {fill.path} lacks {', '.join(missing)}; {self.how_to_get()}")
+        if not fill.own_weights:
+            self._require_published(fill.path)
+
+    def _require_published(self, path: Path) -> None:
+        """Hold those files against their published hashes that have one."""
+        for file in (file for file in self.files if file.sha256):
+            for found in _found(path, file.name):
+                if not (got := sha256_of(found)).startswith(file.sha256):
+                    raise CheckpointError(
+                        f"{self.label}: expected {found} to have the published sha256 {file.sha256}, got {got}: it is "
+                        f"cut short or another file; {self.how_to_get()}; for weights of your own say "
+                        "own_weights: true in roles.yaml (or --own-weights)"
+                    )
+
+    def companions(self, fill: Fill) -> list[Path]:
+        """The files of `beside` that are there, in its order."""
+        if fill.path is None:
+            return []
+        return [found for file in self.beside for found in _found(fill.path, file.name)]
+
+    def hashes(self, fill: Fill) -> dict[str, str]:
+        """The checkpoint's files that were looked for, by name: sha256, and whether it is the published one."""
+        if fill.path is None:
+            return {}
+        words = {}
+        for file in self.files:
+            for found in _found(fill.path, file.name) if file.name else [fill.path]:
+                against = "as published" if file.sha256 and not fill.own_weights else "not compared"
+                words[found.name] = f"{sha256_of(found)} ({against if file.sha256 else 'none published'})"
+        return words | {found.name: f"{sha256_of(found)} (used beside it)" for found in self.companions(fill)}
 
     def how_to_get(self) -> str:
         """Where the right file is, for the end of an error."""

@@ -17,7 +17,7 @@ from torch.nn.functional import interpolate
 
 from ahoy_core.conventions import GREY, Cameras
 from ahoy_core.models.adapter import Adapter, Fill
-from ahoy_core.models.external import exchange, read_pictures, run_command, write_cameras, write_picture
+from ahoy_core.models.external import ExternalModel, exchange, read_pictures, run_command, write_cameras, write_picture
 
 
 class Cap4dOptions(BaseModel):
@@ -34,19 +34,10 @@ class Cap4dOptions(BaseModel):
     expression_names: tuple[str, ...] = ()
 
 
-class Cap4d:
-    """CAP4D as the role "face".
-
-    Args:
-        fill: its command and time limit.
-        adapter: for messages.
-        options: the knobs.
-    """
+class Cap4d(ExternalModel[Cap4dOptions]):
+    """CAP4D as the role "face"."""
 
     name = "CAP4D"
-
-    def __init__(self, fill: Fill, adapter: Adapter, options: Cap4dOptions) -> None:
-        self.fill, self.adapter, self.options = fill, adapter, options
 
     def __call__(self, references: Tensor, expressions: Tensor, cameras: Cameras, seed: int = 0) -> Tensor:
         """Pictures of the head from P cameras over grey 0.5.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from ahoy_core.models.errors import CheckpointError
+from ahoy_core.models.hashes import sha256_of
 
 if TYPE_CHECKING:
     from ahoy_core.models.adapter import Adapter, DType, Fill
@@ -29,7 +29,7 @@ def read_state(path: Path, adapter: Adapter) -> dict[str, Tensor]:
     except Exception as error:  # torch raises whatever its readers meet in a broken file
         raise CheckpointError(
             f"{adapter.label}: {path} cannot be read as weights ({short(error)}, {path.stat().st_size} bytes, sha256 "
-            f"{digest(path)[:12]}); it is truncated or no weights file: {adapter.how_to_get()}"
+            f"{sha256_of(path)[:12]}); it is truncated or no weights file: {adapter.how_to_get()}"
         ) from error
     if not isinstance(state, Mapping) or not all(isinstance(value, Tensor) for value in state.values()):
         raise CheckpointError(f"{adapter.label}: {path} holds no table of tensors; {adapter.how_to_get()}")
@@ -106,12 +106,6 @@ def dtype_of(fill: Fill, adapter: Adapter) -> torch.dtype:
     """The dtype of the weights; half precision on a GPU alone unless it is asked for by name."""
     name: DType = fill.dtype or (adapter.dtype if device_of(fill).type == "cuda" else "float32")
     return {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}[name]
-
-
-def digest(path: Path) -> str:
-    """Sha256 of a file."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def in_batches(

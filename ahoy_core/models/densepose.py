@@ -6,6 +6,7 @@ coarse to fine parts with a chart coordinate for each.
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any, Final
 
 import torch
@@ -13,11 +14,14 @@ from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor
 from torch.nn.functional import interpolate
 
+from ahoy_core.formats.densepose import ChartTable, read_chart_table
+from ahoy_core.formats.errors import BodyFileError
 from ahoy_core.models.adapter import Adapter, Fill
 from ahoy_core.models.boxes import subject_among
 from ahoy_core.models.checkpoint import device_of
 from ahoy_core.models.contracts import Charts
 from ahoy_core.models.errors import CheckpointError
+from ahoy_core.models.people_adapters import SMPL_FILES, TABLE_FILE
 from ahoy_core.models.torchscript import load_script
 
 PARTS: Final = (
@@ -50,12 +54,23 @@ class DensePose:
         device: where it is.
         options: the knobs.
         label: of the adapter, for messages.
+        table: its charts on SMPL's vertices, where the user has the table.
+        smpl: SMPL's file, which says where these vertices are.
     """
 
     name = "DensePose"
 
-    def __init__(self, model: Any, device: torch.device, options: DensePoseOptions, label: str) -> None:
+    def __init__(
+        self,
+        model: Any,
+        device: torch.device,
+        options: DensePoseOptions,
+        label: str,
+        table: ChartTable | None = None,
+        smpl: Path | None = None,
+    ) -> None:
         self.model, self.device, self.options, self._label = model, device, options, label
+        self.table, self.smpl = table, smpl
 
     @torch.no_grad()
     def __call__(self, frames: Tensor, boxes: Tensor) -> Charts:
@@ -120,9 +135,15 @@ def load_densepose(fill: Fill, adapter: Adapter) -> DensePose:
         adapter: its declaration.
 
     Raises:
-        CheckpointError: it is no TorchScript.
+        CheckpointError: it is no TorchScript, or the table beside it is none.
     """
+    beside = {path.name: path for path in adapter.companions(fill)}
+    try:
+        table = read_chart_table(beside[TABLE_FILE]) if TABLE_FILE in beside else None
+    except BodyFileError as error:
+        raise CheckpointError(f"{adapter.label}: {error}") from error
+    smpl = next((beside[name] for name in SMPL_FILES if name in beside), None)
     model = load_script(fill, adapter)
     device = device_of(fill)
     model = model.float() if device.type == "cpu" else model  # exports in half precision don't run on a CPU
-    return DensePose(model, device, DensePoseOptions(**fill.options), adapter.label)
+    return DensePose(model, device, DensePoseOptions(**fill.options), adapter.label, table, smpl)

@@ -10,7 +10,7 @@ import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Final
+from typing import Final, Generic, TypeVar
 
 import torch
 from torch import Tensor
@@ -19,6 +19,8 @@ from ahoy_core.conventions import Cameras
 from ahoy_core.formats.images import read_png, to_float, to_uint8, write_png
 from ahoy_core.models.adapter import Adapter, Fill
 from ahoy_core.models.errors import CommandError
+
+Options = TypeVar("Options")
 
 LOG_TAIL: Final = 1500  # characters of the command's own words that an error repeats
 _PASSED_ON: Final = (
@@ -80,6 +82,19 @@ def run_command(fill: Fill, adapter: Adapter, given: Path, made: Path, more: Map
         raise CommandError(
             f"{adapter.label}: {words[0]!r} ended with status {status}; its last words: {_tail(log_path)}"
         )
+
+
+class ExternalModel(Generic[Options]):
+    """A role's model that runs as a command.
+
+    Args:
+        fill: its command and time limit.
+        adapter: for messages.
+        options: the knobs.
+    """
+
+    def __init__(self, fill: Fill, adapter: Adapter, options: Options) -> None:
+        self.fill, self.adapter, self.options = fill, adapter, options
 
 
 def _put_in(word: str, values: Mapping[str, str]) -> str:

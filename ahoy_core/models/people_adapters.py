@@ -6,6 +6,10 @@ from typing import Final
 
 from ahoy_core.models.adapter import Adapter, ExpectedFile
 
+TABLE_FILE: Final = "UV_Processed.mat"
+"""DensePose's own name of its table of charts."""
+SMPL_FILES: Final = ("SMPL_NEUTRAL.npz", "SMPL_MALE.npz", "SMPL_FEMALE.npz")
+
 _WEIGHTS = ExpectedFile("*.safetensors", "weights; with *.safetensors.index.json where there are several files")
 
 PEOPLE: Final = (
@@ -18,6 +22,11 @@ PEOPLE: Final = (
         licence_at="smpl-x.is.tue.mpg.de/modellicense.html",
         source="smpl-x.is.tue.mpg.de after registration: SMPLX_NEUTRAL.npz, as `path`",
         files=(ExpectedFile("", "SMPL, SMPL+H or SMPL-X as .npz"),),
+        beside=(
+            ExpectedFile("uv.obj|smpl_uv.obj|smplx_uv.obj", "texture coordinates, where the file has none"),
+            ExpectedFile("SMPL-X__FLAME_vertex_ids.npy", "which vertices are the head"),
+            ExpectedFile("FLAME_NEUTRAL.npz|flame2023.npz|generic_model.npz", "FLAME, for its expressions"),
+        ),
         endings=(".npz",),
         load="ahoy_core.models.smpl_family:load_body_file",
     ),
@@ -64,6 +73,10 @@ PEOPLE: Final = (
         licence_at="github.com/facebookresearch/detectron2/blob/main/projects/DensePose/doc/DENSEPOSE_IUV.md",
         source="an export of densepose_rcnn_R_50_FPN_s1x (github.com/dajes/DensePose-TorchScript), as `path`",
         files=(ExpectedFile("", "densepose_rcnn_*.pt"),),
+        beside=(
+            ExpectedFile(TABLE_FILE, "DensePose's charts on SMPL's vertices: maps them to the body's UV"),
+            ExpectedFile("|".join(SMPL_FILES), "SMPL's own file, where the body is another: its licence binds you"),
+        ),
         endings=(".pt",),
         device="cuda",
         is_code=True,

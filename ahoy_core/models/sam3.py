@@ -47,20 +47,24 @@ class Sam3Options(BaseModel):
     min_overlap: float = Field(default=0.2, ge=0, le=1)
 
 
-class Sam3Image:
-    """Frames one by one: of the people found, the one whose box meets the subject's best.
+class _Prompted:
+    """SAM 3 with a prompt.
 
     Args:
-        model: `Sam3Model`.
+        model: `Sam3Model` or `Sam3VideoModel`.
         ids: [1,32] of the prompt.
         attention: [1,32].
         options: the knobs.
     """
 
-    name = "SAM 3 (image)"
-
     def __init__(self, model: Any, ids: Tensor, attention: Tensor, options: Sam3Options) -> None:
         self.model, self.ids, self.attention, self.options = model, ids, attention, options
+
+
+class Sam3Image(_Prompted):
+    """Frames one by one: of the people found, the one whose box meets the subject's best."""
+
+    name = "SAM 3 (image)"
 
     @torch.no_grad()
     def __call__(self, frames: Tensor, boxes: Tensor) -> Tensor:
@@ -94,20 +98,10 @@ class Sam3Image:
         return mask * (best >= 0)[:, None, None, None]
 
 
-class Sam3Video:
-    """A shot as a video: of the people that SAM 3 tracks, the one that stays in the subject's boxes.
-
-    Args:
-        model: `Sam3VideoModel`.
-        ids: [1,32] of the prompt.
-        attention: [1,32].
-        options: the knobs.
-    """
+class Sam3Video(_Prompted):
+    """A shot as a video: of the people that SAM 3 tracks, the one that stays in the subject's boxes."""
 
     name = "SAM 3 (video)"
-
-    def __init__(self, model: Any, ids: Tensor, attention: Tensor, options: Sam3Options) -> None:
-        self.model, self.ids, self.attention, self.options = model, ids, attention, options
 
     @torch.no_grad()
     def __call__(self, frames: Tensor, boxes: Tensor) -> Tensor:

@@ -17,7 +17,7 @@ from ahoy_core.conventions import GREY
 from ahoy_core.models.adapter import Adapter, Fill
 from ahoy_core.models.boxes import mask_bounds
 from ahoy_core.models.errors import CommandError
-from ahoy_core.models.external import exchange, read_pictures, run_command, write_picture
+from ahoy_core.models.external import ExternalModel, exchange, read_pictures, run_command, write_picture
 
 SIDES: Final = {"front": 0.0, "left": 90.0, "back": 180.0, "right": 270.0}
 """Our azimuths in degrees, by which side of the person is seen."""
@@ -40,19 +40,10 @@ class SyncHumanOptions(BaseModel):
     side: int = Field(default=768, ge=16)
 
 
-class SyncHuman:
-    """SyncHuman as the role "views".
-
-    Args:
-        fill: its command and time limit.
-        adapter: for messages.
-        options: the knobs.
-    """
+class SyncHuman(ExternalModel[SyncHumanOptions]):
+    """SyncHuman as the role "views"."""
 
     name = "SyncHuman"
-
-    def __init__(self, fill: Fill, adapter: Adapter, options: SyncHumanOptions) -> None:
-        self.fill, self.adapter, self.options = fill, adapter, options
 
     def __call__(self, image: Tensor, mask: Tensor) -> tuple[Tensor, tuple[float, ...]]:
         """The person from four sides over grey 0.5.

@@ -11,8 +11,9 @@ import torch
 from torch import Tensor
 
 from ahoy_core.models.adapter import Adapter, Fill
-from ahoy_core.models.checkpoint import device_of, digest, short
+from ahoy_core.models.checkpoint import device_of, short
 from ahoy_core.models.errors import CheckpointError
+from ahoy_core.models.hashes import sha256_of
 
 
 def load_script(fill: Fill, adapter: Adapter, methods: Sequence[str] = ("forward",), file: Path | None = None) -> Any:
@@ -35,7 +36,7 @@ def load_script(fill: Fill, adapter: Adapter, methods: Sequence[str] = ("forward
     except Exception as error:  # the reader raises RuntimeError, ValueError and others, by where the file breaks
         raise CheckpointError(
             f"{adapter.label}: {path} cannot be read as TorchScript ({short(error)}, {path.stat().st_size} bytes, "
-            f"sha256 {digest(path)[:12]}); it is truncated or no TorchScript: {adapter.how_to_get()}"
+            f"sha256 {sha256_of(path)[:12]}); it is truncated or no TorchScript: {adapter.how_to_get()}"
         ) from error
     missing = [name for name in methods if not hasattr(model, name)]
     if missing:

@@ -7,7 +7,6 @@ CPU in float32, so that solvers need not know where the networks are.
 from __future__ import annotations
 
 from dataclasses import fields, replace
-from typing import Any, Final
 
 import torch
 from pydantic import BaseModel, ConfigDict, Field
@@ -19,17 +18,16 @@ from ahoy_core.models.errors import CheckpointError
 from ahoy_core.models.offline import stay_offline
 from ahoy_core.prior.conditioning import Context
 from ahoy_core.prior.format import Components, PriorFormatError, read_index
-from ahoy_core.prior.text import IDENTITY_TOKEN, embed_ids, embedding_weight, token_ids
-from ahoy_core.prior.video import WanVideo
-
-LIKE: Final = "person"
-"""The word that the identity token starts as."""
+from ahoy_core.prior.text import add_identity_token, embed_ids, token_ids
+from ahoy_core.prior.video import WAN_HEIGHT, WanVideo
 
 
 class WanOptions(BaseModel):
     """Knobs.
 
     Attributes:
+        height: pixels of the person images that it is asked for, a multiple of 64; they are half as wide. Wan was
+            trained at 480 x 832 and (5B) 704 x 1280.
         offload: keep one network on the GPU at a time, the others in main memory.
         tiling: let the autoencoder work in tiles: less memory, a little slower.
         max_tokens: of a prompt; Wan was trained with 512.
@@ -37,6 +35,7 @@ class WanOptions(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
+    height: int = Field(default=WAN_HEIGHT, ge=64, multiple_of=64)
     offload: bool = False
     tiling: bool = False
     max_tokens: int = Field(default=512, ge=1, le=512)
@@ -52,7 +51,7 @@ class PlacedWan(WanVideo):
     """
 
     def __init__(self, components: Components, device: torch.device, options: WanOptions) -> None:
-        super().__init__(components, options.max_tokens)
+        super().__init__(components, options.max_tokens, options.height)
         self.device, self.options = device, options
 
     def encode(self, frames: Tensor) -> Tensor:
@@ -152,23 +151,5 @@ def load_wan(fill: Fill, adapter: Adapter, experts: int) -> PlacedWan:
         boundary=index.get("boundary_ratio"),
         expand_timesteps=bool(index.get("expand_timesteps", False)),
     )
-    add_identity_token(components)
+    add_identity_token(components.tokenizer, components.text_encoder)
     return PlacedWan(components, device_of(fill), options)
-
-
-def add_identity_token(components: Components) -> None:
-    """Give a published tokenizer the learned word of equation 2; it starts as the word `LIKE`.
-
-    Wan's table of embeddings has more rows than its tokenizer has words; it grows only where it has not.
-    """
-    tokenizer: Any = components.tokenizer
-    if IDENTITY_TOKEN in tokenizer.get_vocab():
-        return
-    like = tokenizer(LIKE, add_special_tokens=False).input_ids
-    tokenizer.add_tokens([IDENTITY_TOKEN], special_tokens=True)
-    if len(tokenizer) > len(embedding_weight(components.text_encoder)):
-        components.text_encoder.resize_token_embeddings(len(tokenizer), mean_resizing=False)
-    table = embedding_weight(components.text_encoder)
-    with torch.no_grad():
-        table[tokenizer.convert_tokens_to_ids(IDENTITY_TOKEN)] = table[like].mean(0)
-    components.text_encoder.requires_grad_(False)

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ahoy_core.body.packaged import PackagedBody
+from ahoy_core.body.model import BodyModel
 from ahoy_core.conventions import Cameras
 from ahoy_core.prior.raster import rasterize
 
@@ -18,11 +18,11 @@ CHANNELS: Final = 7
 CELL: Final = 4  # pixels of the person image a cell of the maps
 
 
-def body_maps(body: PackagedBody, vertices: Tensor, cameras: Cameras) -> Tensor:
+def body_maps(body: BodyModel, vertices: Tensor, cameras: Cameras) -> Tensor:
     """Maps of posed bodies, one camera a frame.
 
     Args:
-        body: the packaged body.
+        body: that the vertices are of; the embedded prior knows the packaged one alone.
         vertices: [T,V,3] posed, world, metres.
         cameras: T cameras with the person image's size, a multiple of `CELL`.
 
@@ -69,8 +69,9 @@ def camera_azimuth(viewmats: Tensor, root_rotations: Tensor) -> Tensor:
     return torch.atan2(own[:, 0], -own[:, 1]) % (2 * math.pi)
 
 
-def _places(body: PackagedBody) -> np.ndarray:
+def _places(body: BodyModel) -> np.ndarray:
     """[V,3]: the average adult's vertices at rest, scaled to [-1,1] along each axis."""
-    rest = body.shape(body.default_betas[None])[0][0]
+    still = torch.zeros(1, body.n_joints, 3)
+    rest = body(still, body.default_betas[None], still[:, 0]).vertices[0]
     low, high = rest.amin(0), rest.amax(0)
     return (2 * (rest - low) / (high - low) - 1).numpy()

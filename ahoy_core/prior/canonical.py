@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, Final, Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ahoy_core.body.packaged import PackagedBody
+from ahoy_core.body.model import BodyModel
 from ahoy_core.conventions import GREY, canonical_cameras
 from ahoy_core.prior.completion import Pictures, pose_context, repaint
 from ahoy_core.prior.config import PriorConfig
@@ -25,34 +26,44 @@ from ahoy_core.texture.texture import canonical_vertices
 
 Array = NDArray[Any]
 
-CLEAN_UP = "prior, clean-up"
-INVERSION = "prior, inversion"
+CLEAN_UP: Final = "prior, clean-up"
+INVERSION: Final = "prior, inversion"
+METHODS: Final[Mapping[str, Literal["clean-up", "inversion"]]] = {CLEAN_UP: "clean-up", INVERSION: "inversion"}
+"""Competitor of the self-check -> the method of `PriorConfig` that it stands for."""
+
+
+def ways(video: VideoModel) -> tuple[str, ...]:
+    """The competitors that a prior can send: without an input for coarse latents, RF-inversion alone."""
+    return (CLEAN_UP, INVERSION) if video.reads_bodies else (INVERSION,)
 
 
 class CanonicalFill:
     """From what stays observed of a texture to its four canonical views, completed by symmetry and diffusion.
 
     Args:
-        body: the packaged body.
+        body: the run's body.
         betas: [S] the subject's shape.
         observed: the atlas of the video.
+        size: height and width of the views, pixels; `VideoModel.size`.
 
     Attributes:
         points: [N,3] of the atlas' texels in canonical pose, metres.
         observed: [N] bool, texels that the video showed.
-        maps: body maps [1,4,7,32,16] of the four views, front, left, back, right.
+        maps: body maps [1,4,7,H/4,W/4] of the four views, front, left, back, right.
         azimuth: [1,4] radians.
     """
 
-    def __init__(self, body: PackagedBody, betas: Array, observed: ObservedAtlas) -> None:
-        self._atlas = observed
+    def __init__(
+        self, body: BodyModel, betas: Array, observed: ObservedAtlas, size: tuple[int, int] = (HEIGHT, WIDTH)
+    ) -> None:
+        self._atlas, self._size = observed, size
         self._surface = Surface.of(body)
         self._texels = texel_map(self._surface, len(observed.coverage))
         self._vertices = canonical_vertices(body, betas)
         self.points = self._texels.points(self._vertices, self._surface.faces)
         self.observed: Array = observed.coverage.ravel()[self._texels.flat] > 0
         vertices = torch.from_numpy(self._vertices)
-        cameras = canonical_cameras(vertices, HEIGHT, WIDTH)
+        cameras = canonical_cameras(vertices, *size)
         upright = torch.eye(3).expand(4, 3, 3)
         self.maps, self.azimuth = pose_context(body, vertices.expand(4, -1, -1), upright, cameras)
 
@@ -68,18 +79,21 @@ class CanonicalFill:
             source_frame=np.where(known, self._atlas.source_frame, -1).astype(np.int32),
         )
         filled = fill_atlas(atlas, self._surface, self._texels, self._vertices)
-        made = canonical_views(self._surface, self._texels, self._vertices, atlas, filled.rgb, HEIGHT, WIDTH)
+        made = canonical_views(self._surface, self._texels, self._vertices, atlas, filled.rgb, *self._size)
         rgba = torch.from_numpy(made.views).permute(0, 3, 1, 2).float() / 255
         alpha = rgba[:, 3:]
         coverage = torch.from_numpy(made.coverage)[:, None].float() / 255
-        return Pictures(rgba[:, :3] * alpha + GREY * (1 - alpha), alpha, coverage)
+        return Pictures(rgba[:, :3] * alpha + GREY * (1 - alpha), alpha, coverage, moving=False)
 
 
 def check_prior(video: VideoModel, fill: CanonicalFill, seed: int = 0, regions: int = 3) -> SelfCheck:
-    """The prior's two ways against the symmetric fill on hidden parts of what a video showed."""
+    """The prior's ways against the symmetric fill on hidden parts of what a video showed.
+
+    The clean-up takes part where the prior reads coarse latents.
+    """
 
     def by(config: PriorConfig) -> Any:
         return lambda given: repaint(video, given, fill.maps, fill.azimuth, config)
 
-    rivals = {CLEAN_UP: by(PriorConfig(seed=seed)), INVERSION: by(PriorConfig(method="inversion", seed=seed))}
+    rivals = {name: by(PriorConfig(method=METHODS[name], seed=seed)) for name in ways(video)}
     return self_check(fill.points, fill.observed, fill, rivals, np.random.default_rng(seed), regions)

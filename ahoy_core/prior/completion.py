@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import torch
 from torch import Tensor
 
-from ahoy_core.body.packaged import PackagedBody
+from ahoy_core.body.model import BodyModel
 from ahoy_core.conventions import Cameras
 from ahoy_core.prior.bodymaps import body_maps, camera_azimuth
-from ahoy_core.prior.conditioning import Context, held_tokens
+from ahoy_core.prior.conditioning import PATCH, Context, held_tokens
 from ahoy_core.prior.config import PriorConfig
 from ahoy_core.prior.corpus.prompts import NEUTRAL
 from ahoy_core.prior.inversion import clean_up, hallucinate
 from ahoy_core.prior.video import VideoModel
+
+HELD_SHARE: Final = 0.5
+"""Observed share of the first frame's person from which a published model goes on from it."""
 
 
 @dataclass(frozen=True)
@@ -25,11 +29,13 @@ class Pictures:
         frames: [T,3,H,W] in [0,1] over grey; a coarse guess where nothing is known.
         mask: [T,1,H,W] alpha of the person, hidden parts included.
         coverage: [T,1,H,W] in [0,1], 1 where `frames` shows what was observed.
+        moving: they follow each other as a video's frames do; views from four sides do not.
     """
 
     frames: Tensor
     mask: Tensor
     coverage: Tensor
+    moving: bool = True
 
     def __post_init__(self) -> None:
         shape = (len(self.frames), 1, *self.frames.shape[2:])
@@ -40,13 +46,11 @@ class Pictures:
             )
 
 
-def pose_context(
-    body: PackagedBody, vertices: Tensor, root_rotations: Tensor, cameras: Cameras
-) -> tuple[Tensor, Tensor]:
+def pose_context(body: BodyModel, vertices: Tensor, root_rotations: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]:
     """Body maps [1,T,7,H/4,W/4] and azimuths [1,T] of posed bodies.
 
     Args:
-        body: the packaged body.
+        body: that the vertices are of.
         vertices: [T,V,3] posed, world.
         root_rotations: [T,3,3].
         cameras: T cameras.
@@ -67,15 +71,20 @@ def repaint(
 
     Args:
         video: the prior, with or without an identity adapter.
-        pictures: T frames; a coarse guess everywhere, and how much of it was observed.
-        body: [1,T,7,H/4,W/4] from `pose_context`.
-        azimuth: [1,T].
+        pictures: T frames of the prior's size; a coarse guess everywhere, and how much of it was observed.
+        body: [1,T,7,H/4,W/4] from `pose_context`; not looked at by a prior that reads no bodies.
+        azimuth: [1,T], likewise.
         config: knobs.
         prompt: of the way back (the subject's, where there is an adapter).
 
     Returns:
         [T,3,H,W] in [0,1], as the prior made them: observed pixels are not pasted back (see `composited`).
+
+    Raises:
+        ValueError: a prior that reads no coarse latents is asked for the clean-up, which consists in reading them.
     """
+    if not video.reads_bodies:
+        return _repaint_unread(video, pictures, config, prompt)
     coarse = video.encode(pictures.frames.transpose(0, 1)[None])
     coverage, mask = pictures.coverage[None, :, 0], pictures.mask[None, :, 0]
     held = held_tokens(coverage, mask) if config.hold else torch.zeros_like(held_tokens(coverage, mask))
@@ -96,6 +105,41 @@ def repaint(
     else:
         latents = hallucinate(video, coarse, context, video.embed([NEUTRAL]), config.inversion, generator).latents
     return video.decode(latents)[0].transpose(0, 1)
+
+
+def _repaint_unread(video: VideoModel, pictures: Pictures, config: PriorConfig, prompt: str) -> Tensor:
+    """`repaint` by a published video model: pose and silhouette come in by RF-inversion of the coarse latents alone.
+
+    Pictures that are no video are asked for one by one. Of a video the first frame is held clean where the model was
+    trained to go on from one and most of it was observed.
+    """
+    if config.method != "inversion":
+        raise ValueError(
+            "expected the method inversion, got clean-up: this prior has no input for coarse latents; set "
+            "hallucinate.method=inversion"
+        )
+    count = len(pictures.frames)
+    clip = pictures.frames[:, :, None]  # [N,3,1,H,W]
+    if pictures.moving:
+        last = pictures.frames[-1:].expand(video.clip_frames(count) - count, -1, -1, -1)
+        clip = torch.cat([pictures.frames, last]).transpose(0, 1)[None]
+    coarse = video.encode(clip)
+    text, neutral = (video.embed([words]).expand(len(clip), -1, -1) for words in (prompt, NEUTRAL))
+    context = Context(text)
+    if config.hold and pictures.moving and video.holds_first_frame and _mostly_observed(pictures):
+        batch, _, times, height, width = coarse.shape
+        held = torch.zeros(batch, times, height // PATCH, width // PATCH, dtype=torch.bool)
+        held[:, 0] = True
+        context = Context(text, known=coarse, held=held)
+    generator = torch.Generator().manual_seed(config.seed)
+    made = video.decode(hallucinate(video, coarse, context, neutral, config.inversion, generator).latents)
+    return made[0].transpose(0, 1)[:count] if pictures.moving else made[:, :, 0]
+
+
+def _mostly_observed(pictures: Pictures) -> bool:
+    """Whether the video showed at least `HELD_SHARE` of the person in the first picture."""
+    mask, coverage = pictures.mask[0], pictures.coverage[0]
+    return float(torch.minimum(mask, coverage).sum()) >= HELD_SHARE * float(mask.sum()) > 0
 
 
 def composited(generated: Tensor, pictures: Pictures) -> Tensor:

@@ -10,34 +10,44 @@ from torch import Tensor, nn
 from ahoy_core.avatar.avatar import Avatar
 from ahoy_core.avatar.hallucinated import Supervision
 from ahoy_core.avatar.render import render
-from ahoy_core.body.packaged import PackagedBody
+from ahoy_core.body.model import BodyModel
 from ahoy_core.body.rotations import axis_angle_to_matrix
 from ahoy_core.conventions import GREY, Cameras
 from ahoy_core.prior.completion import Pictures, pose_context
+from ahoy_core.prior.framing import HEIGHT, WIDTH
 from ahoy_core.prior.sequences import PlannedSequence
 
-FACTOR: Final = 2
-"""Pixels of the stored cameras to one of the prior's: renders are compared after the same area filter."""
+RENDERED: Final = 2 * HEIGHT
+"""Rows that a sequence is rendered with at least: small pictures are compared after the same area filter."""
 _PERSON: Final = 0.06  # difference from grey above which a generated pixel shows somebody
 
 
-def fine_cameras(cameras: Cameras, factor: int = FACTOR) -> Cameras:
-    """The same cameras with `factor` times the pixels along each side."""
-    scale = torch.tensor([float(factor), float(factor), 1.0])[:, None]
-    size = factor * cameras.width, factor * cameras.height
-    return Cameras(cameras.viewmats, cameras.Ks * scale, *size, cameras.camera_model)
+def fine_cameras(cameras: Cameras, size: tuple[int, int] = (HEIGHT, WIDTH)) -> tuple[Cameras, int]:
+    """The cameras that render a sequence for pictures of a size, and how many of their pixels are one of the picture's.
+
+    Args:
+        cameras: as planned, in the prior's framing.
+        size: height and width of the pictures, of the planned aspect; `VideoModel.size`.
+    """
+    factor = max(1, RENDERED // size[0])
+    scale = factor * size[0] / cameras.height
+    Ks = cameras.Ks * torch.tensor([scale, scale, 1.0])[:, None]
+    return Cameras(cameras.viewmats, Ks, factor * size[1], factor * size[0], cameras.camera_model), factor
 
 
 @torch.no_grad()
-def coarse_pictures(avatar: Avatar, body: PackagedBody, sequence: PlannedSequence) -> Pictures:
+def coarse_pictures(
+    avatar: Avatar, body: BodyModel, sequence: PlannedSequence, size: tuple[int, int] = (HEIGHT, WIDTH)
+) -> Pictures:
     """The coarse avatar in a planned sequence, with the observed share of every pixel.
 
     Args:
         avatar: the coarse avatar.
         body: its body.
         sequence: T frames.
+        size: height and width of the pictures.
     """
-    cameras = fine_cameras(sequence.cameras)
+    cameras, factor = fine_cameras(sequence.cameras, size)
     frames, masks, coverage = [], [], []
     observed = avatar.observed[:, None].expand(-1, 3).contiguous()
     for t in range(len(sequence.pose)):
@@ -47,14 +57,13 @@ def coarse_pictures(avatar: Avatar, body: PackagedBody, sequence: PlannedSequenc
         frames.append(shown.images[0])
         masks.append(shown.alphas[0])
         coverage.append(covered.images[0, :1])
-    return Pictures(*(_reduced(torch.stack(values)) for values in (frames, masks, coverage)))
+    picture, alpha, share = (
+        nn.functional.avg_pool2d(torch.stack(v).clamp(0, 1), factor) for v in (frames, masks, coverage)
+    )
+    return Pictures(picture, alpha, share)
 
 
-def _reduced(pictures: Tensor) -> Tensor:
-    return nn.functional.avg_pool2d(pictures.clamp(0, 1), FACTOR)
-
-
-def sequence_context(body: PackagedBody, betas: Tensor, sequence: PlannedSequence) -> tuple[Tensor, Tensor]:
+def sequence_context(body: BodyModel, betas: Tensor, sequence: PlannedSequence) -> tuple[Tensor, Tensor]:
     """Body maps [1,T,7,H/4,W/4] and azimuths [1,T] of a planned sequence of a shape `betas` [S]."""
     count = len(sequence.pose)
     with torch.no_grad():
@@ -95,7 +104,7 @@ def as_supervision(sequence: PlannedSequence, frames: Tensor, pictures: Pictures
         map_pose=sequence.map_pose,
         pose=sequence.pose,
         transl=sequence.transl,
-        cameras=fine_cameras(sequence.cameras),
+        cameras=fine_cameras(sequence.cameras, (frames.shape[2], frames.shape[3]))[0],
         alphas=pictures.mask[:, 0],
         keeps_head=True,  # no face views come from the prior: nothing else shows the head from behind
     )

@@ -81,6 +81,27 @@ def add_identity(video: VideoModel, rank: int, seed: int) -> None:
         for network in experts(video):
             network.requires_grad_(False)
             network.add_adapter(config, adapter_name=ADAPTER)
+            for parameter in network.parameters():
+                if parameter.requires_grad:  # updates are small: in half precision most would be lost
+                    parameter.data = parameter.data.float()
+
+
+@contextmanager
+def borrowed(video: VideoModel) -> Iterator[VideoModel]:
+    """A model for one subject: when the block ends, adapter and word are gone, and it is as it was loaded.
+
+    Loading a published model takes minutes, so a process keeps it for the next subject.
+    """
+    number = identity_token_id(video.components.tokenizer)
+    word = embedding_weight(video.components.text_encoder)[number].detach().clone()
+    try:
+        yield video
+    finally:
+        for network in experts(video):
+            if ADAPTER in getattr(network, "peft_config", {}):
+                network.unload_lora()
+        with torch.no_grad():
+            embedding_weight(video.components.text_encoder)[number] = word
 
 
 def has_identity(video: VideoModel) -> bool:
@@ -128,7 +149,7 @@ def train_identity(
     groups = [{"params": updates, "lr": config.lr}, {"params": [word], "lr": config.token_lr}]
     optimizer = torch.optim.AdamW(groups, betas=(0.9, 0.99), weight_decay=0.0)
     losses = []
-    with _spoken(video, word):
+    with _spoken(video, word), _checkpointed(video):
         for step in range(config.steps):
             rows = torch.randint(len(clean), (config.batch,), generator=generator)
             loss = _identity_loss(video, clean[rows], weight[rows], _context(video, frames, rows), generator)
@@ -211,12 +232,25 @@ def _learned_word(video: VideoModel) -> nn.Parameter:
 
 
 @contextmanager
+def _checkpointed(video: VideoModel) -> Iterator[None]:
+    """Within the block a published model's blocks compute their activations anew for the gradient, to fit a GPU."""
+    large = [] if video.reads_bodies else experts(video)
+    for network in large:
+        network.enable_gradient_checkpointing()
+    try:
+        yield
+    finally:
+        for network in large:
+            network.disable_gradient_checkpointing()
+
+
+@contextmanager
 def _spoken(video: VideoModel, word: nn.Parameter) -> Iterator[None]:
     """Within the block the encoder reads the identity token as `word`, without a gradient for the whole table."""
     number = identity_token_id(video.components.tokenizer)
 
     def replaced(_: nn.Module, inputs: tuple[Tensor, ...], output: Tensor) -> Tensor:
-        return torch.where((inputs[0] == number)[..., None], word.to(output.dtype), output)
+        return torch.where((inputs[0] == number)[..., None], word.to(output), output)
 
     video.components.text_encoder.requires_grad_(False)
     hook = video.components.text_encoder.encoder.embed_tokens.register_forward_hook(replaced)

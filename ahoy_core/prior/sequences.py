@@ -11,9 +11,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ahoy_core.body.lbs import forward_kinematics, lbs
-from ahoy_core.body.packaged import PackagedBody
-from ahoy_core.body.rotations import matrix_to_axis_angle
+from ahoy_core.body.convert import convert_body_pose
+from ahoy_core.body.model import BodyModel
+from ahoy_core.body.packaged import PackagedBody, load_packaged_body
+from ahoy_core.body.rotations import axis_angle_to_matrix, matrix_to_axis_angle
 from ahoy_core.conventions import Cameras
 from ahoy_core.prior.corpus.poses import Angles, pose_rotations
 from ahoy_core.prior.framing import orbit_cameras
@@ -74,7 +75,7 @@ class MotionPlan:
 
 
 def plan_motions(
-    body: PackagedBody,
+    body: BodyModel,
     betas: Tensor,
     coverage: Tensor,
     frames: int = FRAMES,
@@ -84,7 +85,7 @@ def plan_motions(
     """Chooses structured motions that show what the video did not.
 
     Args:
-        body: the packaged body.
+        body: the run's body.
         betas: [S] the subject's shape.
         coverage: [F] in [0,1], observed share of each triangle of the body.
         frames: T of each sequence.
@@ -113,27 +114,27 @@ def plan_motions(
 
 
 def _candidate(
-    body: PackagedBody, betas: Tensor, coverage: Tensor, name: str, frames: int
+    body: BodyModel, betas: Tensor, coverage: Tensor, name: str, frames: int
 ) -> tuple[PlannedSequence, float]:
     kind, angles = ACTIONS[name]
-    rotations = pose_rotations(body, angles)
+    rotations = _action_rotations(body, betas, angles)
     azimuths = torch.arange(frames) * (2 * math.pi / frames)
     turned = rotations.expand(frames, -1, -1, -1).clone()
     if kind == "turn":
         turned[:, 0] = _about_z(-azimuths)  # turning to one's right shows what a camera going to one's left sees
-    rest, joints = body.shape(betas[None])
-    transl = torch.zeros(frames, 3)
-    vertices = lbs(rest[0], body.lbs_weights, forward_kinematics(turned, joints, body.parents, transl))
+    transl, pose = torch.zeros(frames, 3), matrix_to_axis_angle(turned)
+    rest = body(torch.zeros(1, body.n_joints, 3), betas[None], transl[:1]).vertices[0]
+    vertices = body(pose, betas[None].expand(frames, -1), transl).vertices
     cameras = orbit_cameras(vertices, torch.zeros(frames) if kind == "turn" else azimuths)
     seen = _visible(body, vertices, cameras)
-    areas = _areas(rest[0], body.faces) * ~body.face_regions["interior"]
+    areas = _areas(rest, body.faces) * ~body.regions["interior"][body.faces].all(1)
     areas = areas / areas.sum()
     shown, unseen = float(areas[seen].sum()), float((areas * (coverage < OBSERVED))[seen].sum())
     sequence = PlannedSequence(
         name=name,
         kind=kind,
         map_pose=matrix_to_axis_angle(rotations),
-        pose=matrix_to_axis_angle(turned),
+        pose=pose,
         transl=transl,
         cameras=cameras,
         unseen=unseen,
@@ -143,7 +144,18 @@ def _candidate(
     return sequence, shown
 
 
-def _visible(body: PackagedBody, vertices: Tensor, cameras: Cameras) -> Tensor:
+def _action_rotations(body: BodyModel, betas: Tensor, angles: Angles) -> Tensor:
+    """Parent-relative rotations [J,3,3] of an action: written for the packaged body, carried over to any other."""
+    packaged = body if isinstance(body, PackagedBody) else load_packaged_body()
+    rotations = pose_rotations(packaged, angles)
+    if packaged is body:
+        return rotations
+    posed = matrix_to_axis_angle(rotations)[None]
+    converted, _ = convert_body_pose(packaged, body, posed, torch.zeros(1, 3), target_betas=betas)
+    return axis_angle_to_matrix(converted[0])
+
+
+def _visible(body: BodyModel, vertices: Tensor, cameras: Cameras) -> Tensor:
     """Triangles [F] bool that some frame sees (at four times the prior's resolution)."""
     fine = Cameras(
         cameras.viewmats, _scaled(cameras.Ks, 4.0), 4 * cameras.width, 4 * cameras.height, cameras.camera_model

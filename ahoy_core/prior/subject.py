@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ahoy_core.body.packaged import PackagedBody
+from ahoy_core.body.model import BodyModel
 from ahoy_core.conventions import Cameras, person_image
 from ahoy_core.prior.bodymaps import body_maps, camera_azimuth
 from ahoy_core.prior.framing import HEIGHT, WIDTH, framing_Ks
@@ -16,9 +16,10 @@ def subject_frames(
     images: Tensor,
     visible: Tensor,
     cameras: Cameras,
-    body: PackagedBody,
+    body: BodyModel,
     vertices: Tensor,
     root_rotations: Tensor,
+    size: tuple[int, int] = (HEIGHT, WIDTH),
 ) -> Frames:
     """Cuts a subject out of N frames, framed by the whole fitted body, hidden parts included.
 
@@ -26,17 +27,19 @@ def subject_frames(
         images: [N,3,H,W] in [0,1].
         visible: [N,1,H,W] alpha of the visible subject.
         cameras: N pinhole cameras of the frames.
-        body: the packaged body.
+        body: the run's body.
         vertices: [N,V,3] fitted, world, metres.
         root_rotations: [N,3,3].
+        size: height and width of the person images, pixels; `VideoModel.size`.
 
     Raises:
         ValueError: when a body stands behind its camera, or no frame shows the subject.
     """
-    Ks = framing_Ks(cameras.viewmats, vertices, together=False)
-    framed = Cameras(cameras.viewmats, Ks, WIDTH, HEIGHT, cameras.camera_model)
+    height, width = size
+    Ks = framing_Ks(cameras.viewmats, vertices, height, width, together=False)
+    framed = Cameras(cameras.viewmats, Ks, width, height, cameras.camera_model)
     cut = [
-        person_image(image, mask, K, HEIGHT, WIDTH, crop=new @ torch.linalg.inv(K))
+        person_image(image, mask, K, height, width, crop=new @ torch.linalg.inv(K))
         for image, mask, K, new in zip(images, visible, cameras.Ks, Ks, strict=True)
     ]
     return Frames(

@@ -13,6 +13,8 @@ from ahoy_core.prior.corpus.prompts import COLOURS, NEUTRAL, WEARABLES
 
 IDENTITY_TOKEN: Final = "<v>"
 """[v] of the paper: the learned word for the subject; reserved in the vocabulary, trained per video."""
+LIKE: Final = "person"
+"""The word that the identity token starts as in a published tokenizer."""
 IDENTITY_PROMPT: Final = f"a {IDENTITY_TOKEN} person"
 MAX_TOKENS: Final = 24
 """Longer prompts are cut here: the corpus' longest caption has 19."""
@@ -79,3 +81,20 @@ def identity_token_id(tokenizer: Any) -> int:
 def embedding_weight(text_encoder: Any) -> torch.nn.Parameter:
     """The table that the encoder looks words up in (`get_input_embeddings()` is another copy without gradient)."""
     return text_encoder.encoder.embed_tokens.weight
+
+
+def add_identity_token(tokenizer: Any, text_encoder: Any) -> None:
+    """Give a published tokenizer the learned word of equation 2; it starts as the word `LIKE`.
+
+    Wan's table of embeddings has more rows than its tokenizer has words; it grows only where it has not.
+    """
+    if IDENTITY_TOKEN in tokenizer.get_vocab():
+        return
+    like = tokenizer(LIKE, add_special_tokens=False).input_ids
+    tokenizer.add_tokens([IDENTITY_TOKEN], special_tokens=True)
+    if len(tokenizer) > len(embedding_weight(text_encoder)):
+        text_encoder.resize_token_embeddings(len(tokenizer), mean_resizing=False)
+    table = embedding_weight(text_encoder)
+    with torch.no_grad():
+        table[tokenizer.convert_tokens_to_ids(IDENTITY_TOKEN)] = table[like].mean(0)
+    text_encoder.requires_grad_(False)

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Final, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
 
 from ahoy_core.prior.conditioning import Context, hold, timesteps, transformer_input
 from ahoy_core.prior.format import Components, load_components
-from ahoy_core.prior.text import embed_ids, token_ids
+from ahoy_core.prior.framing import HEIGHT, WIDTH
+from ahoy_core.prior.text import add_identity_token, embed_ids, token_ids
+
+WAN_HEIGHT: Final = 832
+"""Pixels: the longer side of the smaller size that Wan 2.2 was trained at."""
 
 
 @runtime_checkable
@@ -24,6 +29,25 @@ class VideoModel(Protocol):
     @property
     def components(self) -> Components:
         """The networks, for fine-tuning."""
+        ...
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width of the person images that it is asked for, pixels."""
+        ...
+
+    @property
+    def reads_bodies(self) -> bool:
+        """Whether body maps, azimuths and coarse latents condition it; where not, they change nothing."""
+        ...
+
+    @property
+    def holds_first_frame(self) -> bool:
+        """Whether a first frame that is held clean conditions it, of models that read no bodies."""
+        ...
+
+    def clip_frames(self, frames: int) -> int:
+        """Frames of the shortest clip that it codes and that has `frames` or more."""
         ...
 
     def encode(self, frames: Tensor) -> Tensor:
@@ -50,8 +74,16 @@ class EmbeddedVideo:
         components: from `load_components`.
     """
 
+    size = HEIGHT, WIDTH
+    reads_bodies = True
+    holds_first_frame = False  # it holds any token
+
     def __init__(self, components: Components) -> None:
         self.components = components
+
+    def clip_frames(self, frames: int) -> int:
+        """See `VideoModel`: any number will do."""
+        return frames
 
     def encode(self, frames: Tensor) -> Tensor:
         """See `VideoModel`."""
@@ -75,7 +107,7 @@ class EmbeddedVideo:
         """See `VideoModel`."""
         times = _times(tau, latents)
         network = self.components.transformer
-        dtype = next(network.parameters()).dtype
+        dtype = _input_dtype(network)
         stacked = transformer_input(latents, context).to(dtype)
         steps = timesteps(times, latents, context.held)
         velocity = network(stacked, steps, context.text.to(dtype), return_dict=False)[0].to(latents)
@@ -83,15 +115,27 @@ class EmbeddedVideo:
 
 
 class WanVideo:
-    """Wan 2.2 as published: 5B (one timestep a token) or A14B (two experts); bodies and coarse latents are not used.
+    """Wan 2.2 as published: 5B (one timestep a token) or A14B (two experts).
+
+    It has no channels for body maps or coarse latents. 5B was trained to go on from a first frame at timestep 0; A14B
+    (text to video) holds nothing.
 
     Args:
         components: from `load_components`, with `AutoencoderKLWan`.
         max_tokens: of a prompt; Wan was trained with 512.
+        height: pixels of the person images that it is asked for; they are half as wide.
     """
 
-    def __init__(self, components: Components, max_tokens: int = 512) -> None:
+    reads_bodies = False
+
+    def __init__(self, components: Components, max_tokens: int = 512, height: int = WAN_HEIGHT) -> None:
         self.components, self.max_tokens = components, max_tokens
+        self.size = height, height // 2
+        self.holds_first_frame = components.expand_timesteps
+
+    def clip_frames(self, frames: int) -> int:
+        """See `VideoModel`: 4k + 1."""
+        return 4 * math.ceil((frames - 1) / 4) + 1
 
     def encode(self, frames: Tensor) -> Tensor:
         """See `VideoModel`; T is 4k + 1."""
@@ -123,7 +167,7 @@ class WanVideo:
         velocity = torch.empty_like(latents)
         for network in {id(n): n for n in (self.expert(float(t)) for t in times)}.values():
             rows = torch.tensor([self.expert(float(t)) is network for t in times])
-            dtype = next(network.parameters()).dtype
+            dtype = _input_dtype(network)
             steps = 1000 * times[rows]
             if self.components.expand_timesteps:
                 steps = timesteps(times[rows], latents[rows], None if held is None else held[rows])
@@ -142,8 +186,16 @@ class WanVideo:
 def load_video(folder: Path, dtype: torch.dtype = torch.float32) -> EmbeddedVideo | WanVideo:
     """The video model in a folder: the embedded prior or a published Wan pipeline, told apart by its autoencoder."""
     components = load_components(folder, dtype)
-    embedded = type(components.vae).__name__ == "FrameAutoencoder"
-    return EmbeddedVideo(components) if embedded else WanVideo(components)
+    if type(components.vae).__name__ == "FrameAutoencoder":
+        return EmbeddedVideo(components)
+    add_identity_token(components.tokenizer, components.text_encoder)
+    return WanVideo(components)
+
+
+def _input_dtype(network: Any) -> torch.dtype:
+    """What a transformer takes. Its first parameters stay float32 whatever it was loaded as; its convolution tells."""
+    dtype: torch.dtype = network.patch_embedding.weight.dtype
+    return dtype
 
 
 def _times(tau: float | Tensor, latents: Tensor) -> Tensor:

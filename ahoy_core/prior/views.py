@@ -46,6 +46,7 @@ class PriorBody:
         Raises:
             ValueError: for another size than that of the canonical views.
         """
+        self._check(image, mask)
         return self._with_front(image, mask, mask).completed(), AZIMUTHS
 
     def inpaint(self, image: Tensor, mask: Tensor, prompt: str = "", seed: int = 0) -> Tensor:
@@ -61,21 +62,26 @@ class PriorBody:
             ValueError: for another size than that of the canonical views.
         """
         seeded = replace(self, config=self.config.model_copy(update={"seed": seed}))
+        self._check(image, mask)
         silhouette = self.pictures.mask[0]
         return seeded._with_front(image, silhouette, silhouette * (1 - mask)).completed()[0]
 
     def _with_front(self, image: Tensor, silhouette: Tensor, observed: Tensor) -> PriorBody:
         given = self.pictures
-        if image.shape != given.frames.shape[1:] or observed.shape != given.mask.shape[1:]:
-            raise ValueError(
-                f"expected image {tuple(given.frames.shape[1:])} and mask of the canonical views' size, got "
-                f"{tuple(image.shape)} and {tuple(observed.shape)}; render them with the same camera"
-            )
         # What the given front leaves open keeps the coarse fill as the prior's first guess.
         front = image * observed + given.frames[0] * (1 - observed)
         pictures = Pictures(
             torch.cat([front[None], given.frames[1:]]),
             torch.cat([silhouette[None], given.mask[1:]]),
             torch.cat([observed[None], given.coverage[1:]]),
+            moving=False,
         )
         return replace(self, pictures=pictures)
+
+    def _check(self, image: Tensor, mask: Tensor) -> None:
+        given = self.pictures
+        if image.shape != given.frames.shape[1:] or mask.shape != given.mask.shape[1:]:
+            raise ValueError(
+                f"expected image {tuple(given.frames.shape[1:])} and mask of the canonical views' size, got "
+                f"{tuple(image.shape)} and {tuple(mask.shape)}; render them with the same camera"
+            )

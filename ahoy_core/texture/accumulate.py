@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -13,8 +14,8 @@ from ahoy_core.texture.atlas import AtlasAccumulator, ObservedAtlas
 from ahoy_core.texture.consensus import LEAST_VOTES, Consensus, Votes
 from ahoy_core.texture.exposure import Exposure
 from ahoy_core.texture.inputs import TextureConfig
-from ahoy_core.texture.rays import FloatArray, IntArray
-from ahoy_core.texture.surface import REFERENCE_HEIGHT, SeenFrame, Surface, height_in_pixels, look, trust
+from ahoy_core.texture.rays import Caster, FloatArray, IntArray, to_camera
+from ahoy_core.texture.surface import REFERENCE_HEIGHT, SeenFrame, Surface, height_in_pixels, trust
 from ahoy_core.texture.texels import TexelMap
 
 Progress = Callable[[int, int], None]
@@ -23,6 +24,20 @@ Progress = Callable[[int, int], None]
 POSED_TOGETHER = 16
 # Frames that vote on a texel's colour, spread over the video: bounds the cost and the memory of the first pass.
 VOTING_FRAMES = 16
+
+
+class SecondOpinion(Protocol):
+    """Somebody else's word on the surface (`ahoy_core.texture.dense`)."""
+
+    def registered(
+        self, number: int, caster: Caster, K: FloatArray, image: IntArray, visible: IntArray
+    ) -> tuple[IntArray, IntArray]:
+        """A frame's picture [H,W,3] and mask [H,W], moved to where the fitted body has them."""
+        ...
+
+    def checked(self, number: int, seen: SeenFrame) -> SeenFrame:
+        """The frame without trust where another surface is seen than the fitted body's."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -38,13 +53,14 @@ class Log:
 class Look:
     """One frame about to be read.
 
-    Its number, how it is seen (None: its body is not finite), its picture [H,W,3] uint8 at the atlas's exposure, and
-    what was changed for that.
+    Its number, how it is seen (None: its body is not finite), its picture [H,W,3] uint8 at the atlas's exposure, its
+    mask [H,W] uint8, and what was changed for that.
     """
 
     number: int
     seen: SeenFrame | None
     image: IntArray
+    visible: IntArray
     shift: tuple[float, float] = (0.0, 0.0)
     exposure: Exposure | None = None
 
@@ -53,7 +69,7 @@ class Look:
 class Clip:
     """Frames [T,H,W,3] uint8, visible masks [T,H,W] uint8, the arrays of body.npz, the body and the knobs.
 
-    `checked` takes back a frame's trust where somebody else sees another surface than the fitted body's.
+    `second` is somebody else's word on which surface a pixel shows.
     """
 
     frames: IntArray
@@ -62,7 +78,7 @@ class Clip:
     body: BodyModel
     surface: Surface
     config: TextureConfig
-    checked: Callable[[int, SeenFrame], SeenFrame] = lambda number, seen: seen
+    second: SecondOpinion | None = None
 
 
 def accumulate(
@@ -86,9 +102,9 @@ def accumulate(
         for view in _looks(clip, atlas, voters):
             if view.seen is not None:
                 gains.append(np.ones(3) if view.exposure is None else view.exposure.gain)
-                texel, rgb, _, _ = atlas.read(view.image, clip.visible[view.number], view.seen)
+                texel, rgb, _, _ = atlas.read(view.image, view.visible, view.seen)
                 votes.add(texel, rgb)
-                atlas.add(view.number, view.image, clip.visible[view.number], view.seen)
+                atlas.add(view.number, view.image, view.visible, view.seen)
             done = _report(progress, done, total)
         # 0 levels: everything is written, and the consensus only ranks it.
         consensus = votes.consensus(points, config.outlier_levels or 255.0)
@@ -105,7 +121,7 @@ def accumulate(
         if view.seen is not None:
             confidence = fit["frame_confidence"][t] * (weights @ fit["joint_confidence"][t])
             floor = config.min_joint_confidence * float(fit["frame_confidence"][t])
-            log.written[t] = atlas.add(t, view.image, clip.visible[t], view.seen, confidence, floor)
+            log.written[t] = atlas.add(t, view.image, view.visible, view.seen, confidence, floor)
         done = _report(progress, done, total)
     return atlas.result(), log
 
@@ -133,20 +149,24 @@ def _looks(clip: Clip, atlas: AtlasAccumulator, numbers: list[int]) -> Iterator[
     for t, vertices in _posed(clip, numbers):
         image, visible = clip.frames[t], clip.visible[t]
         if not np.isfinite(vertices).all():
-            yield Look(t, None, image)
+            yield Look(t, None, image, visible)
             continue
-        grazing, boundary = config.grazing_cos, config.boundary_px
-        view = clip.fit["viewmat"]
-        seen = look(clip.surface, vertices, view, K, visible, grazing_cos=grazing, boundary_px=boundary)
-        seen = clip.checked(t, seen)
+        caster = Caster(to_camera(vertices, clip.fit["viewmat"]), clip.surface.faces)
+        if clip.second is not None:
+            image, visible = clip.second.registered(t, caster, K, image, visible)
+        seen = _trusted(clip, t, caster, K, visible)
         exposure = atlas.exposure(image, seen, config.exposure)
         image = image if exposure is None else exposure.apply(image)
         reach = config.align_px * height_in_pixels(seen.hits) / REFERENCE_HEIGHT
         shift = atlas.shift(image, seen, reach)
         if shift != (0.0, 0.0):
-            seen = trust(clip.surface, seen.caster, _shifted(K, shift), visible, grazing, boundary)
-            seen = clip.checked(t, seen)
-        yield Look(t, seen, image, shift, exposure)
+            seen = _trusted(clip, t, caster, _shifted(K, shift), visible)
+        yield Look(t, seen, image, visible, shift, exposure)
+
+
+def _trusted(clip: Clip, number: int, caster: Caster, K: FloatArray, visible: IntArray) -> SeenFrame:
+    seen = trust(clip.surface, caster, K, visible, clip.config.grazing_cos, clip.config.boundary_px)
+    return seen if clip.second is None else clip.second.checked(number, seen)
 
 
 def _shifted(K: FloatArray, shift: tuple[float, float]) -> FloatArray:

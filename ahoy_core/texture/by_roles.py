@@ -1,83 +1,89 @@
-"""Texture with real models: DensePose's word on which limb a pixel shows, FLUX's and SyncHuman's on what is unseen."""
+"""Texture with real models: DensePose's word on what a pixel shows, FLUX's and SyncHuman's on what is unseen."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ahoy_core.body.load import load_body
+from ahoy_core.body.model import BodyModel
+from ahoy_core.body.register import vertices_on
 from ahoy_core.conventions import GREY
+from ahoy_core.formats.densepose import SMPL_VERTICES
 from ahoy_core.models.contracts import Inpaint, SurfaceParts, Views
-from ahoy_core.models.densepose import PARTS as DENSE_PARTS
-from ahoy_core.texture.surface import ARM, LEG, PARTS, REFERENCE_HEIGHT, SeenFrame, Surface, height_in_pixels
+from ahoy_core.models.errors import CheckpointError
+from ahoy_core.models.people_adapters import SMPL_FILES, TABLE_FILE
+from ahoy_core.texture.dense import ChartMap, DenseSurface, chart_map
+from ahoy_core.texture.surface import Surface
 from ahoy_core.texture.texture import Texture
 
-REACH = 5.0  # pixels of a body 200 pixels tall by which DensePose and the fit may disagree on where a limb ends
 PIECE = 32  # frames handed to a model at once
 KNOWN = 128  # of 255: coverage from which a pixel of a canonical view counts as observed
 _NOTHING = 0.02  # difference from grey below which a generated view shows nothing
-_LIMB_WORDS = {ARM: "arm", LEG: "leg"}
-_PART_WORDS = {"head": "head", "hands": "hand", "feet": "foot"}
-
-Parts = NDArray[np.uint8]
 
 
-def parts_by(surface: SurfaceParts, frames: Parts, boxes: NDArray[np.float32], used: NDArray[np.bool_]) -> Parts:
-    """DensePose's parts [T,H,W] of the subject in the used frames.
+def dense_by(
+    role: SurfaceParts,
+    surface: Surface,
+    frames: NDArray[np.uint8],
+    boxes: NDArray[np.float32],
+    used: NDArray[np.bool_],
+    charts: ChartMap | None = None,
+) -> DenseSurface:
+    """What DensePose says of the subject in the used frames.
 
     Args:
-        surface: the role.
+        role: the role "surface".
+        surface: the body's triangles.
         frames: [T,H,W,3] sRGB.
         boxes: [T,4] x0 y0 x1 y1 of the visible person.
-        used: [T]; others are 0.
+        used: [T]; the others get no part.
+        charts: where its charts lie on the body, or None.
     """
     there = torch.where(torch.from_numpy(used)[:, None], torch.from_numpy(boxes).float(), float("nan"))
-    out = []
+    parts, uvs = [], []
     for start in range(0, len(frames), PIECE):
         rows = slice(start, start + PIECE)
         pictures = torch.from_numpy(np.ascontiguousarray(frames[rows])).permute(0, 3, 1, 2).float() / 255
-        out.append(surface(pictures, there[rows]).part.numpy())
-    return np.concatenate(out)
+        found = role(pictures, there[rows])
+        parts.append(found.part.numpy())
+        uvs.append((255 * found.uv).round().to(torch.uint8).permute(0, 2, 3, 1).numpy())
+    return DenseSurface(surface, np.concatenate(parts), np.concatenate(uvs), charts)
 
 
-def agreement(surface: Surface, parts: Parts) -> Callable[[int, SeenFrame], SeenFrame]:
-    """What a frame's trust becomes where DensePose sees another limb than the fitted body has there.
+def charts_on(role: Any, body: BodyModel, surface: Surface) -> ChartMap | None:
+    """Where the role's charts lie on the body: by its table where the user gave one, None where not.
 
     Args:
-        surface: the body's triangles.
-        parts: [T,H,W] from `parts_by`.
+        role: the role "surface", with `table` and `smpl` (`ahoy_core.models.densepose.DensePose`).
+        body: the run's body.
+        surface: its triangles.
 
-    Returns:
-        Maps a frame's number and what the fit says of it to what both say.
+    Raises:
+        CheckpointError: the table is there, but not the SMPL file that its vertices belong to.
     """
-    words = np.array(DENSE_PARTS)
-    of_face = np.array([_word(surface, face) for face in range(len(surface.faces))])
-
-    def checked(number: int, seen: SeenFrame) -> SeenFrame:
-        size = 2 * max(1, round(REACH * height_in_pixels(seen.hits) / REFERENCE_HEIGHT)) + 1
-        near = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
-        said = words[parts[number]]
-        agreed = np.zeros(seen.valid.shape, dtype=bool)
-        for word in set(_PART_WORDS.values()) | set(_LIMB_WORDS.values()) | {"torso"}:
-            around = cv2.dilate((said == word).astype(np.uint8), near) > 0
-            agreed |= around & (of_face[seen.hits.face] == word)
-        return replace(seen, valid=seen.valid & agreed)
-
-    return checked
-
-
-def _word(surface: Surface, face: int) -> str:
-    """What DensePose would call a triangle."""
-    part = PARTS[surface.part[face]]
-    if part in _PART_WORDS:
-        return _PART_WORDS[part]
-    limbs = surface.limb[surface.faces[face]]
-    return _LIMB_WORDS.get(int(np.bincount(limbs).argmax()), "torso")
+    table = getattr(role, "table", None)
+    if table is None:
+        return None
+    if len(body.lbs_weights) == SMPL_VERTICES:
+        smpl = body
+    elif role.smpl is None:
+        raise CheckpointError(
+            f"expected SMPL's own file beside {TABLE_FILE}, whose charts lie on its {SMPL_VERTICES} vertices, got none "
+            f"and the body {body.name!r}; put one of {', '.join(SMPL_FILES)} there, or take the table away"
+        )
+    else:
+        smpl = load_body(str(role.smpl))
+    still = torch.zeros(1, body.n_joints, 3)
+    with torch.no_grad():
+        rest = body(still, body.default_betas[None], still[:, 0]).vertices[0]
+        placed = rest if smpl is body else vertices_on(smpl, body)
+    return chart_map(table, placed.double().numpy(), surface, rest.double().numpy())
 
 
 def complete_by(

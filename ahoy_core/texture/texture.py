@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,13 +11,13 @@ import torch
 
 from ahoy_core.body.canonical import canonical_pose
 from ahoy_core.body.model import BodyModel
-from ahoy_core.texture.accumulate import Clip, Log, Progress, accumulate
+from ahoy_core.texture.accumulate import Clip, Log, Progress, SecondOpinion, accumulate
 from ahoy_core.texture.atlas import ObservedAtlas
 from ahoy_core.texture.canonical import canonical_views
 from ahoy_core.texture.fill import FilledAtlas, fill_atlas
 from ahoy_core.texture.inputs import TextureConfig, check_inputs, choose_frames
 from ahoy_core.texture.rays import BoolArray, FloatArray, IntArray
-from ahoy_core.texture.surface import SeenFrame, Surface
+from ahoy_core.texture.surface import Surface
 from ahoy_core.texture.texels import TexelMap, texel_map
 
 FILL_WORDS = {
@@ -68,7 +68,7 @@ def build_texture(
     config: TextureConfig,
     progress: Progress | None = None,
     canonical: FloatArray | None = None,
-    checked: Callable[[int, SeenFrame], SeenFrame] = lambda number, seen: seen,
+    second: SecondOpinion | None = None,
 ) -> Texture:
     """Accumulate the atlas over the frames, complete it, and view the textured body in canonical pose.
 
@@ -81,7 +81,7 @@ def build_texture(
         config: knobs.
         progress: called with frames done and frames in all, of both passes.
         canonical: [V,3] the fitted shape in the canonical pose theta_*; `canonical_vertices` by default.
-        checked: see `ahoy_core.texture.accumulate.Clip`.
+        second: see `ahoy_core.texture.accumulate.Clip`.
 
     Raises:
         ValueError: where shapes disagree, or an array is missing.
@@ -92,7 +92,7 @@ def build_texture(
     chosen, rejected = choose_frames(fit["used"], fit["frame_confidence"], config)
     vertices = canonical_vertices(body, fit["betas"]) if canonical is None else canonical
     points = texels.points(vertices, surface.faces)
-    clip = Clip(frames, visible, fit, body, surface, config, checked)
+    clip = Clip(frames, visible, fit, body, surface, config, second)
     observed, log = accumulate(clip, texels, points, chosen, progress)
     filled = fill_atlas(observed, surface, texels, vertices, config.fill)
     rendered = canonical_views(

@@ -1,8 +1,8 @@
 """Where videos come from: local files, http(s), object stores through fsspec, pages through yt-dlp."""
 
+from storage_schema.secrets import redact, shown
 from tasks.sources.fetch import fetch_source
 from tasks.sources.policy import SourcePolicy, policy_from_environment
-from tasks.sources.redact import redact, shown
 from tasks.sources.uri import Uri, parse_source, safe_name, source_name, youtube_id
 
 __all__ = [

@@ -8,13 +8,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 from storage_schema.keys import file_sha256
+from storage_schema.secrets import shown
 from tasks.errors import MissingSourceError, TransientError, UnusableSourceError, is_transient
 from tasks.sources.cache import CacheEntry, Notes, cache_entry, prune
 from tasks.sources.copying import Limits, with_retries
 from tasks.sources.objects import copy_object
 from tasks.sources.pages import fetch_page
 from tasks.sources.policy import SourcePolicy
-from tasks.sources.redact import shown
 from tasks.sources.uri import Uri, parse_source
 from tasks.sources.web import download
 from tasks.stage import Source

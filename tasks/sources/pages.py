@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 from typing import Any
 
+from storage_schema.secrets import redact
 from tasks.errors import (
     BadInputError,
     MissingExtraError,
@@ -18,7 +19,6 @@ from tasks.sources.cache import CacheEntry, Notes
 from tasks.sources.copying import Limits, finished
 from tasks.sources.gate import open_gate
 from tasks.sources.policy import SourcePolicy
-from tasks.sources.redact import redact
 from tasks.sources.web import status_error
 
 # Over plain http(s) or DASH segments alone: HLS may be handed to an FFmpeg program, which connects on its own.

@@ -12,10 +12,10 @@ from urllib.parse import parse_qs, unquote, urlsplit
 
 import httpx
 
+from storage_schema.secrets import has_secret, shown
 from tasks.errors import BadInputError, RefusedSourceError, UnusableSourceError
 from tasks.sources.address import address_of_literal, refusal
 from tasks.sources.policy import YOUTUBE_HOSTS, SourcePolicy
-from tasks.sources.redact import has_secret, shown
 
 Kind = Literal["local", "web", "page", "object"]
 

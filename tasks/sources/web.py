@@ -15,6 +15,7 @@ from typing import Any
 import httpcore
 import httpx
 
+from storage_schema.secrets import redact, shown
 from tasks.errors import (
     BadInputError,
     MissingSourceError,
@@ -26,7 +27,6 @@ from tasks.sources.address import resolve
 from tasks.sources.cache import CacheEntry, Notes
 from tasks.sources.copying import Limits, append, finished
 from tasks.sources.policy import SourcePolicy
-from tasks.sources.redact import redact, shown
 from tasks.sources.uri import check_web
 
 USER_AGENT = "ahoy"

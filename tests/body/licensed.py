@@ -225,6 +225,28 @@ def write(folder: Path, kind: str, **changes: np.ndarray | None) -> Path:
     return path
 
 
+FLAME_VERTICES = 5023
+
+
+def write_flame(folder: Path, **changes: np.ndarray | None) -> Path:
+    """FLAME's file in its true layout, and the list that says which of SMPL-X's vertices are FLAME's."""
+    smplx = arrays("smplx")["v_template"]
+    ids = np.argsort(-smplx[:, 1], kind="stable")[:FLAME_VERTICES]
+    held = {
+        "v_template": smplx[ids],
+        "f": np.zeros((9976, 3), np.uint32),
+        "weights": np.full((FLAME_VERTICES, 5), 0.2),
+        "J_regressor": np.full((5, FLAME_VERTICES), 1 / FLAME_VERTICES),
+        "kintree_table": np.array([[2**32 - 1, 0, 1, 1, 1], range(5)]).astype(np.uint32),
+        "posedirs": np.zeros((FLAME_VERTICES, 3, 36)),
+        "shapedirs": _waves(smplx[ids], 400, 0.003, 5),
+    } | changes
+    np.save(folder / "SMPL-X__FLAME_vertex_ids.npy", ids)
+    path = folder / "FLAME_NEUTRAL.npz"
+    np.savez(path, **{key: value for key, value in held.items() if value is not None})
+    return path
+
+
 def write_obj(path: Path, kind: str) -> Path:
     """A texture layout as a `.obj`, triangles in another order and turned round by one corner."""
     vertices, faces, uvs = _mesh(kind)

@@ -21,7 +21,7 @@ FILE = {"alex": "alexnet-owt-7be5be79.pth", "vgg": "vgg16-397923af.pth"}
 
 def load(folder: Path, backbone: str) -> Lpips:
     name = f"lpips-{backbone}"
-    network: Lpips = adapter("perceptual", name).open(Fill(fill=name, path=folder, device="cpu"))
+    network: Lpips = adapter("perceptual", name).open(Fill(fill=name, path=folder, device="cpu", own_weights=True))
     return network
 
 

@@ -109,7 +109,10 @@ def sam3(folder: Path) -> Path:
         score_threshold_detection=0.01, new_det_thresh=0.01,
     )  # fmt: skip
     config.image_size = side
-    Sam3VideoModel(config).save_pretrained(folder)
+    model = Sam3VideoModel(config)
+    with torch.no_grad():  # untrained masks are 0.5 everywhere, which is nobody: now they are somewhere 0, somewhere 1
+        model.detector_model.mask_decoder.instance_projection.weight *= 300
+    model.save_pretrained(folder)
     clip_tokenizer().save_pretrained(folder)
     return folder
 
@@ -197,6 +200,7 @@ def build(role: str, name: str, folder: Path) -> Fill:
         path=BUILDERS[role, name](folder),
         device="cpu",
         trust_code=adapter(role, name).is_code,
+        own_weights=any(file.sha256 for file in adapter(role, name).files),
         options=OPTIONS.get((role, name), {}),
     )
 

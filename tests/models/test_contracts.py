@@ -5,45 +5,36 @@ Shapes, ranges, dtypes, the same answer under the same seed, empty and single-fr
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from importlib import resources
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
 from ahoy_core.body.packaged import load_packaged_body
-from ahoy_core.conventions import Cameras, look_at, orbit_eyes, perspective_K
+from ahoy_core.conventions import OBSERVED_VIEWMAT, Cameras, look_at, orbit_eyes, perspective_K
+from ahoy_core.ingest import IngestConfig, ingest
 from ahoy_core.metrics.stlpips import StLpips
-from ahoy_core.models.adapter import Fill
 from ahoy_core.models.catalogue import ADAPTERS, adapter
+from ahoy_core.perceive.networks import Networks
+from ahoy_core.perceive.perceive import PerceiveConfig, Perception, perceive
+from ahoy_core.prior.bodymaps import CELL, CHANNELS
+from ahoy_core.prior.completion import Pictures
 from ahoy_core.prior.conditioning import Context
+from ahoy_core.prior.config import PriorConfig
+from ahoy_core.prior.video import VideoModel, load_video
+from ahoy_core.prior.views import PriorBody
 from ahoy_core.texture.canonical import CanonicalViews
 from ahoy_core.texture.fillings import TexturedBody
-from tests.models.checkpoints import build
+from ahoy_core.texture.surface import PARTS, Surface, correspondences
+from tests.models.conftest import Load, Tiny
+from tests.perceive.conftest import networks  # noqa: F401  (a session fixture)
+from tests.prior.conftest import embedded_folder  # noqa: F401  (likewise)
 
-H, W = 72, 56
-Load = Callable[[str, str], Any]
-
-
-@pytest.fixture(scope="module")
-def load(tmp_path_factory: pytest.TempPathFactory) -> Load:
-    """Builds and loads each adapter once."""
-    loaded: dict[tuple[str, str], Any] = {}
-
-    def once(role: str, name: str) -> Any:
-        if (role, name) not in loaded:
-            fill = build(role, name, tmp_path_factory.mktemp(f"{role}-{name}"))
-            loaded[role, name] = adapter(role, name).open(fill)
-        return loaded[role, name]
-
-    return once
-
-
-@pytest.fixture(scope="module")
-def sam3(tmp_path_factory: pytest.TempPathFactory) -> Fill:
-    """One checkpoint for both modes."""
-    return build("mask", "sam3", tmp_path_factory.mktemp("sam3"))
+H, W = 64, 48
 
 
 def names(role: str, *embedded: str) -> list[str]:
@@ -94,7 +85,8 @@ def test_pose(name: str, load: Load) -> None:
 
 @pytest.mark.parametrize("mode", ["image", "video"])
 @pytest.mark.parametrize("name", names("mask"))
-def test_mask(name: str, mode: str, sam3: Fill) -> None:
+def test_mask(name: str, mode: str, tiny: Tiny) -> None:
+    sam3 = tiny("mask", name)
     role = adapter("mask", name).open(sam3.model_copy(update={"options": {**sam3.options, "mode": mode}}))
     for count in (0, 1, 3):
         masks = role(frames(count), boxes(count))
@@ -121,6 +113,62 @@ def test_surface(name: str, load: Load) -> None:
     assert same([found.part, found.uv], [(again := role(frames(3), boxes(3))).part, again.uv])
 
 
+@pytest.fixture(scope="module")
+def perceived(networks: Networks) -> tuple[np.ndarray, Perception, Perception]:  # noqa: F811
+    """One frame of the bundled clip, and what the embedded pose, mask and head say of it, twice."""
+    with resources.as_file(resources.files("ahoy_core.assets") / "demo.mp4") as path:
+        clip = ingest(path, IngestConfig(max_frames=1, max_size=256)).arrays()
+    body, config = load_packaged_body(), PerceiveConfig(iterations=3)
+    once, again = (perceive(clip["frames"], clip["pts"], clip["shot"], None, body, networks, config) for _ in range(2))
+    return clip["frames"], once, again
+
+
+def test_embedded_pose(perceived: tuple[np.ndarray, Perception, Perception]) -> None:
+    """The landmark networks and the fit: bodies of ours in metres before the camera, one a frame, the same twice."""
+    _, once, again = perceived
+    body = load_packaged_body()
+    assert once.pose.shape == (1, body.n_joints, 3) and once.transl.shape == (1, 3)
+    assert once.betas.shape == (body.n_betas,) and once.joint_confidence.shape == (1, body.n_joints)
+    for name in ("pose", "transl", "betas", "joint_confidence", "frame_confidence"):
+        value = getattr(once, name)
+        assert value.dtype == np.float32 and np.isfinite(value).all() and np.array_equal(value, getattr(again, name))
+    assert 0.5 < once.transl[0, 1] < 20 and 0 <= once.frame_confidence[0] <= 1
+
+
+@pytest.mark.parametrize("name", ["visible", "head"])
+def test_embedded_masks(name: str, perceived: tuple[np.ndarray, Perception, Perception]) -> None:
+    """Role "mask" and role "head" of one frame: somebody is there, and a head is nowhere above the visible person."""
+    frames, once, again = perceived
+    mask = getattr(once, name)
+    assert mask.shape == frames.shape[:3] and mask.dtype == np.uint8 and mask.max() > 128
+    assert bool((once.head <= once.visible).all()) and np.array_equal(mask, getattr(again, name))
+
+
+def test_embedded_pose_mask_and_head_want_a_frame(networks: Networks) -> None:  # noqa: F811
+    empty = np.zeros((0, 32, 32, 3), np.uint8)
+    with pytest.raises(ValueError, match="with T > 0"):
+        perceive(empty, np.zeros(0), np.zeros(0, int), None, load_packaged_body(), networks, PerceiveConfig())
+
+
+def test_embedded_surface() -> None:
+    """The fitted body, ray-cast: parts and UV where the mask sees it, nothing elsewhere."""
+    body = load_packaged_body()
+    surface, K = Surface.of(body), perspective_K(0.6, W, H).numpy()
+    for count in (0, 1, 3):
+        pose, transl = torch.zeros(count, body.n_joints, 3), torch.tensor([[0.0, 4.0, -0.8]]).expand(count, 3)
+        vertices = body(pose, body.default_betas[None].expand(count, -1), transl).vertices.numpy()
+        seen = np.full((count, H, W), 255, np.uint8)
+        seen[1:2] = 0
+        found = correspondences(surface, vertices, OBSERVED_VIEWMAT.numpy(), K, seen)
+        assert found.part.shape == (count, H, W) and found.part.dtype == np.uint8
+        assert found.uv.shape == (count, 2, H, W) and found.uv.dtype == np.float32
+        there = np.broadcast_to((found.part > 0)[:, None], found.uv.shape)
+        assert np.isnan(found.uv[~there]).all() and not (found.uv[there] < 0).any() and not (found.uv[there] > 1).any()
+        assert count == 0 or ((0 < found.part[0].max() < len(PARTS)) and not found.part[1:2].any())
+    again = correspondences(surface, vertices, OBSERVED_VIEWMAT.numpy(), K, seen)
+    assert np.array_equal(found.part, again.part) and np.array_equal(found.uv, again.uv, equal_nan=True)
+
+
 @pytest.mark.parametrize("name", names("head"))
 def test_head(name: str, load: Load) -> None:
     role = load("head", name)
@@ -142,15 +190,27 @@ def textured_body() -> TexturedBody:
     return TexturedBody(CanonicalViews(views, views[..., 3], views[0], cameras))
 
 
+@pytest.fixture(scope="module")
+def prior_body(embedded_folder: Path) -> PriorBody:  # noqa: F811
+    """The embedded prior before one person who fills the pictures; untrained, so its answers are noise."""
+    pictures = Pictures(torch.full((4, 3, H, W), 0.5), torch.ones(4, 1, H, W), torch.zeros(4, 1, H, W), moving=False)
+    maps, azimuth = torch.zeros(1, 4, CHANNELS, H // CELL, W // CELL), torch.zeros(1, 4)
+    return PriorBody(load_video(embedded_folder), pictures, maps, azimuth, PriorConfig())
+
+
+EMBEDDED_PICTURES = ("textured body", "embedded prior")
+
+
 def hole() -> Tensor:
     mask = torch.zeros(1, H, W)
     mask[:, 20:60, 15:40] = 1
     return mask
 
 
-@pytest.mark.parametrize("name", names("inpaint", "textured body"))
-def test_inpaint(name: str, load: Load) -> None:
-    role = textured_body().inpaint if name == "textured body" else load("inpaint", name)
+@pytest.mark.parametrize("name", names("inpaint", *EMBEDDED_PICTURES))
+def test_inpaint(name: str, load: Load, prior_body: PriorBody) -> None:
+    embedded = {"textured body": textured_body().inpaint, "embedded prior": prior_body.inpaint}
+    role = embedded[name] if name in embedded else load("inpaint", name)
     image = frames(1)[0]
     filled = role(image, hole(), "a person", 3)
     assert filled.shape == image.shape and filled.dtype == torch.float32
@@ -165,9 +225,10 @@ def test_inpaint(name: str, load: Load) -> None:
         role(image, torch.zeros(1, H, W + 8))
 
 
-@pytest.mark.parametrize("name", names("views", "textured body"))
-def test_views(name: str, load: Load) -> None:
-    role = textured_body().views if name == "textured body" else load("views", name)
+@pytest.mark.parametrize("name", names("views", *EMBEDDED_PICTURES))
+def test_views(name: str, load: Load, prior_body: PriorBody) -> None:
+    embedded = {"textured body": textured_body().views, "embedded prior": prior_body.views}
+    role = embedded[name] if name in embedded else load("views", name)
     image = frames(1)[0]
     views, azimuths = role(image, hole())
     assert views.shape == (4, 3, H, W) and views.dtype == torch.float32
@@ -182,26 +243,29 @@ def test_face(name: str, load: Load) -> None:
     for count in (0, 1, 3):
         eyes = orbit_eyes(torch.zeros(3), 1.0, torch.linspace(-0.5, 0.5, count))
         cameras = Cameras(look_at(eyes, torch.zeros(3)), perspective_K(0.3, 40, 40).expand(count, 3, 3), 40, 40)
-        made = role(frames(2)[:, :, :56], torch.zeros(count, 52), cameras, 7)
+        made = role(frames(2)[:, :, :W], torch.zeros(count, 52), cameras, 7)
         assert made.shape == (count, 3, 40, 40) and made.dtype == torch.float32
         assert count == 0 or (float(made.min()) >= 0 and float(made.max()) <= 1)
-    assert torch.equal(made, role(frames(2)[:, :, :56], torch.zeros(3, 52), cameras, 7))
-    assert not torch.equal(made, role(frames(2)[:, :, :56], torch.zeros(3, 52), cameras, 8)), "the seed matters"
+    assert torch.equal(made, role(frames(2)[:, :, :W], torch.zeros(3, 52), cameras, 7))
+    assert not torch.equal(made, role(frames(2)[:, :, :W], torch.zeros(3, 52), cameras, 8)), "the seed matters"
     with pytest.raises(ValueError, match="at least one reference"):
         role(frames(0), torch.zeros(3, 52), cameras)
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("name", names("video"))
-def test_video(name: str, load: Load) -> None:
-    role = load("video", name)
+@pytest.mark.parametrize("name", names("video", "embedded prior"))
+def test_video(name: str, load: Load, embedded_folder: Path) -> None:  # noqa: F811
+    role = load_video(embedded_folder) if name == "embedded prior" else load("video", name)
+    assert isinstance(role, VideoModel) and role.size[0] == 2 * role.size[1]
+    assert role.clip_frames(5) == 5 and role.clip_frames(6) >= 6
     for count in (1, 5):
         clip = torch.rand(2, 3, count, 32, 32, generator=torch.Generator().manual_seed(2))
         latents = role.encode(clip)
         text = role.embed(["a <v> person", ""])
         velocity = role.velocity(latents, torch.tensor([0.95, 0.3]), Context(text))
         decoded = role.decode(latents)
-        assert latents.shape[0] == 2 and latents.shape[2] == 1 + (count - 1) // 4
+        times = count if role.reads_bodies else 1 + (count - 1) // 4
+        assert latents.shape[0] == 2 and latents.shape[2] == times
         assert velocity.shape == latents.shape and decoded.shape == clip.shape
         for value in (latents, velocity, decoded, text):
             assert value.dtype == torch.float32 and value.device.type == "cpu" and bool(torch.isfinite(value).all())

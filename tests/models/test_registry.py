@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import importlib
+import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -16,7 +19,7 @@ from ahoy_core.models.catalogue import ADAPTERS, adapter
 from ahoy_core.models.errors import CheckpointError, MissingPackageError, ModelError, UntrustedCodeError
 from tasks.fills import ENVIRONMENT, Fills, fills_from_environment, read_fills, with_flags
 from tasks.role import Role
-from tests.models.checkpoints import BUILDERS
+from tests.models.checkpoints import BUILDERS, build
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -30,6 +33,21 @@ def test_every_adapter_declares_what_a_lawyer_and_an_operator_need(each: adapter
     assert each.files or each.is_command
     for file in each.files:
         assert all(c in "0123456789abcdef" for c in file.sha256) and len(file.sha256) <= 64
+
+
+def test_every_extra_asks_for_something_and_brings_what_its_adapters_import() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras: dict[str, list[str]] = project["optional-dependencies"]
+
+    def brought(extra: str) -> set[str]:
+        names = {re.split(r"[\[<>=]", wanted)[0] for wanted in extras[extra]}
+        inner = [name for wanted in extras[extra] for name in re.findall(r"ahoy-avatars\[(.+)\]", wanted)]
+        return names.union(*(brought(name) for group in inner for name in group.split(",")))
+
+    assert all(extras.values()), "an extra that asks for nothing promises something that it does not do"
+    for each in ADAPTERS:
+        assert each.extra is None or set(each.packages) <= brought(each.extra), each.label
+        assert each.extra is None or set(each.packages) <= brought("all"), each.label
 
 
 def test_names_are_told_apart() -> None:
@@ -94,8 +112,8 @@ def test_a_key_knows_contents_and_knobs_but_no_path_and_no_device(tmp_path: Path
     here, there = build(tmp_path / "here"), build(tmp_path / "there")
 
     def sha(**fields: object) -> str:
-        found = Fills({"perceptual": Fill(fill="lpips-alex", **fields)}).role("perceptual")  # type: ignore[arg-type]
-        assert found is not None and found.name == "LPIPS v0.1 (AlexNet)"
+        found = Fills({"perceptual": Fill(fill="lpips-alex", own_weights=True, **fields)}).role("perceptual")  # type: ignore[arg-type]
+        assert found is not None and found.name == "LPIPS v0.1 (AlexNet), weights of the user's own"
         return found.weights_sha256
 
     assert sha(path=here) == sha(path=there, device="cpu")
@@ -105,11 +123,35 @@ def test_a_key_knows_contents_and_knobs_but_no_path_and_no_device(tmp_path: Path
     assert sha(path=there) != before
 
 
+def test_published_hashes_are_compared_and_a_file_is_read_again_only_when_it_changed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = BUILDERS["perceptual", "lpips-alex"](tmp_path)
+    declared = adapter("perceptual", "lpips-alex")
+    published = [
+        dataclasses.replace(f, sha256=hashlib.sha256((path / f.name).read_bytes()).hexdigest()) for f in declared.files
+    ]
+    honest = dataclasses.replace(declared, files=tuple(published))
+    fill = Fill(fill="lpips-alex", path=path, device="cpu")
+    assert honest.open(fill).name == "LPIPS v0.1 (AlexNet)"
+    assert all("as published" in words for words in honest.hashes(fill).values())
+    read: list[object] = []
+    whole = hashlib.file_digest
+    monkeypatch.setattr(hashlib, "file_digest", lambda file, kind: read.append(file) or whole(file, kind))
+    honest.require(fill)
+    assert not read
+    (path / "alex.pth").write_bytes((path / "alex.pth").read_bytes() + b"x")
+    with pytest.raises(CheckpointError, match=rf"published sha256 {published[1].sha256}, got .* own_weights: true"):
+        honest.open(fill)
+    assert len(read) == 1
+
+
 def test_a_model_is_loaded_once(tmp_path: Path) -> None:
     path = BUILDERS["perceptual", "lpips-alex"](tmp_path)
-    fills = Fills({"perceptual": Fill(fill="lpips-alex", path=path, device="cpu")})
+    own = Fill(fill="lpips-alex", path=path, device="cpu", own_weights=True)
+    fills = Fills({"perceptual": own})
     assert fills.preload() == ["perceptual"], "what works on the CPU can be handed to forks"
-    assert Fills({"perceptual": Fill(fill="lpips-alex", path=path, device="cuda")}).preload() == []
+    assert Fills({"perceptual": own.model_copy(update={"device": "cuda"})}).preload() == []
     assert fills.get("perceptual") is fills.get("perceptual")
     assert fills.get("mask") is None
 
@@ -132,7 +174,7 @@ def test_the_example_of_deploy_is_read_and_fills_every_role() -> None:
 
 def test_a_stage_keeps_its_defaults_where_nothing_is_chosen(tmp_path: Path) -> None:
     default = {"perceptual": Role("ST-LPIPS", "BSD-2-Clause", "1" * 64), "body": Role("b", "x")}
-    fills = Fills({"perceptual": Fill(fill="lpips-alex", path=BUILDERS["perceptual", "lpips-alex"](tmp_path))})
+    fills = Fills({"perceptual": build("perceptual", "lpips-alex", tmp_path)})
     assert fills.filled(default, ()) == default
     changed = fills.filled(default, ("perceptual",))
     assert changed["body"] == default["body"] and changed["perceptual"].name.startswith("LPIPS")

@@ -13,6 +13,7 @@ from ahoy_core.prior.config import IdentityConfig
 from ahoy_core.prior.identity import (
     Frames,
     add_identity,
+    borrowed,
     experts,
     has_identity,
     load_identity,
@@ -84,6 +85,57 @@ def test_diffusers_own_loader_reads_both_experts(folders: dict[str, Path], tmp_p
             torch.testing.assert_close(
                 ours(z, steps, text, return_dict=False)[0], theirs(z, steps, text, return_dict=False)[0], rtol=0, atol=0
             )
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_borrowed_model_is_given_back_as_it_was(form: str, folders: dict[str, Path], tmp_path: Path) -> None:
+    channels, video = 48 if form == "5b" else 16, load_video(folders[form])
+    before = [velocity(video, channels, tau) for tau in (0.95, 0.3)]
+    for subject in range(2):
+        with borrowed(video):
+            train_identity(video, frames(), IdentityConfig(rank=2, steps=4, batch=2, seed=subject))
+            assert not torch.equal(velocity(video, channels, 0.3), before[1])
+            save_identity(video, tmp_path)
+        assert not has_identity(video)
+        for tau, expected in zip((0.95, 0.3), before, strict=True):
+            assert torch.equal(velocity(video, channels, tau), expected)
+    with borrowed(video):
+        load_identity(video, tmp_path)
+        assert not torch.equal(velocity(video, channels, 0.3), before[1])
+    with pytest.raises(RuntimeError, match="cut off"), borrowed(video):
+        add_identity(video, rank=2, seed=0)
+        raise RuntimeError("cut off")
+    assert torch.equal(velocity(video, channels, 0.3), before[1])
+
+
+def test_activations_computed_anew_change_no_loss(
+    wan_folders: dict[str, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from diffusers import WanTransformer3DModel as Network
+
+    losses, switched = [], []
+    enable = Network.enable_gradient_checkpointing
+    for wanted in (True, False):
+
+        def counted(network: Network, wanted: bool = wanted) -> None:
+            switched.append(wanted)
+            if wanted:
+                enable(network)
+
+        monkeypatch.setattr(Network, "enable_gradient_checkpointing", counted)
+        video = load_video(wan_folders["5b"])
+        losses.append(train_identity(video, frames(), IdentityConfig(rank=2, steps=3, batch=2)).losses)
+        assert not experts(video)[0].is_gradient_checkpointing
+    assert switched == [True, False]
+    torch.testing.assert_close(losses[0], losses[1], rtol=1e-5, atol=0)
+
+
+def test_half_precision_weights_are_updated_in_float32(wan_folders: dict[str, Path]) -> None:
+    video = load_video(wan_folders["5b"], torch.bfloat16)
+    train_identity(video, frames(), IdentityConfig(rank=2, steps=2, batch=2))
+    kinds = {p.dtype for n, p in experts(video)[0].named_parameters() if "lora" in n}
+    assert kinds == {torch.float32}
+    assert bool(torch.isfinite(velocity(video, 48, 0.5)).all())
 
 
 def test_a_fresh_adapter_changes_nothing(embedded: VideoModel) -> None:

@@ -50,6 +50,12 @@ def test_what_holds_no_secret_stays_as_it_is(text: str) -> None:
     assert redact_url(text) == text and redact(text) == text
 
 
+def test_an_address_that_is_stored_can_be_opened_again_while_messages_hide_what_only_looks_secret() -> None:
+    url = "https://host/video?id=3f2b8c1d9e7a4f6b8c0d2e1f"
+    assert redact_url(url) == url and redact_json({"a": url}) == {"a": url}
+    assert redact(f"cannot open {url}") == "cannot open https://host/video?id=***"
+
+
 @pytest.mark.parametrize(
     "text",
     [
