@@ -148,7 +148,7 @@ def _base64(path: Path) -> str:
 
 REPORT = Stage(
     "report",
-    4,
+    5,
     ReportConfig,
     ("ingest", "perceive", "texture", "coarse", "avatar", "animate"),
     run_report,
