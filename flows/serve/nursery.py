@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import faulthandler
 import json
+import logging
 import os
 import runpy
 import selectors
@@ -36,6 +37,16 @@ PRELOADED = (
     "flows.feed_batch",
 )
 READY = b"ready\n"
+SEND_S = 5.0  # for what a run said last to reach the server; as long as Prefect gives its logs
+
+
+def _send_what_waits() -> None:
+    """Log lines and events of the last seconds: Prefect sends batches, and `os._exit` runs no exit functions."""
+    from prefect.events.worker import EventsWorker
+
+    with suppress(Exception):  # a server that is gone must not keep a run from ending
+        logging.shutdown()
+        EventsWorker.drain_all(timeout=SEND_S)
 
 
 class Nursery:
@@ -110,6 +121,7 @@ class Nursery:
         except BaseException:
             traceback.print_exc()
         finally:
+            _send_what_waits()
             sys.stdout.flush()
             sys.stderr.flush()
             os._exit(status)

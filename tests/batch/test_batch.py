@@ -107,6 +107,9 @@ def test_status_shows_counts_and_errors_with_an_example(batch: Batch) -> None:
 def test_logs_are_those_of_the_video_asked_for(batch: Batch) -> None:
     shown = batch.ahoy("logs", batch.name, "--video", batch.video("defect").video_id).output
     assert "a defect of ours" in shown and "give another" not in shown
+    # The last line is logged as the process ends, within the interval in which Prefect sends its batches.
+    ended = batch.ahoy("logs", batch.name, "--video", batch.video("good").video_id).output
+    assert "Finished in state Completed" in ended.splitlines()[-1] and len(ended.splitlines()) > len(ONCE) * 2
 
 
 def test_the_retry_button_goes_on_at_the_failed_stage(server: Server, batch: Batch) -> None:
