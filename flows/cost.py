@@ -20,15 +20,14 @@ from pydantic import BaseModel
 from ahoy_core.avatar.files import load_avatar
 from ahoy_core.captures import Capture
 from ahoy_core.cost.sweep import Measurement, Spread, sweep
-from ahoy_core.cost.work import FRAMES, KNOBS, PIXELS
-from ahoy_core.formats.npz import load_npz
+from ahoy_core.cost.work import KNOBS
 from flows.evaluate import Subject, stages_up_to
 from flows.evaluate_request import EvaluateRequest
 from flows.pipeline import call_directly, process
 from storage_schema.store import ArtifactStore
 from tasks.cost.declared import StageSweep
 from tasks.cost.errors import whole_errors
-from tasks.cost.predict import work_knobs
+from tasks.cost.predict import ingested, work_knobs
 from tasks.cost.rows import Rows
 from tasks.cost.truth import TruthConfig, truth_stage
 from tasks.running import resolve_inputs, run_stage
@@ -140,7 +139,7 @@ class _Bench:
         """What decides the work at a setting."""
         changed = {f"{self._declared.stage.name}.{knob}": value for knob, value in setting.items()}
         named = {name: value for name, value in changed.items() if name in KNOBS}
-        return {**work_knobs(self._settings, _clip(self._folders["ingest"])), **named}
+        return {**work_knobs(self._settings, ingested(self._folders["ingest"])), **named}
 
 
 def _untold(done: int, total: int, note: str = "") -> None:
@@ -202,7 +201,7 @@ def _whole(row: Measurement, subject: Subject) -> Measurement:
         wall_s=Spread.of([sum(bill.wall_s for bill in bills)]),
         cpu_s=Spread.of([sum(bill.cpu_s for bill in bills)]),
         peak_mb=Spread.of([max(bill.peak_rss_mb for bill in bills)]),
-        knobs=work_knobs(subject.settings("full"), _clip(folders["ingest"])),
+        knobs=work_knobs(subject.settings("full"), ingested(folders["ingest"])),
         parts=parts,
     )
 
@@ -211,11 +210,6 @@ def _folder(store: ArtifactStore, ref: StageRef) -> Path:
     manifest = store.lookup(ref.key, stage=ref.stage, verify=False)
     assert manifest is not None  # it was made or found a moment ago
     return store.fetch(manifest)
-
-
-def _clip(ingest: Path) -> dict[str, int]:
-    shape = load_npz(ingest / "frames.npz", ["frames"])["frames"].shape
-    return {FRAMES: int(shape[0]), PIXELS: int(shape[1] * shape[2])}
 
 
 def _plain(text: str) -> Any:

@@ -8,10 +8,9 @@ from typing import Any
 
 from ahoy_core.cost.choose import Alternative, alternatives, worth_telling
 from ahoy_core.cost.work import FRAMES, KNOBS, PIXELS, WORK
-from ahoy_core.formats.npz import load_npz
 from storage_schema.store import Manifest
 from tasks.cost.measured import MeasuredSet
-from tasks.cost.predict import LEAST_GAIN_DB, gains_of
+from tasks.cost.predict import LEAST_GAIN_DB, gains_of, ingested
 from tasks.stage import StageContext
 
 _TOLD = 5
@@ -77,8 +76,7 @@ def run_bill(ctx: StageContext, measured: MeasuredSet) -> RunBill:
 
 def known_knobs(ctx: StageContext) -> dict[str, Any]:
     """What decided the work of the stages that were made, by name."""
-    shape = load_npz(ctx.inputs["ingest"] / "frames.npz", ["frames"])["frames"].shape
-    found: dict[str, Any] = {FRAMES: int(shape[0]), PIXELS: int(shape[1] * shape[2])}
+    found: dict[str, Any] = {**ingested(ctx.inputs["ingest"])}
     for knob in KNOBS:
         if knob not in found and (value := _value(ctx.manifests, knob)) is not None:
             found[knob] = value

@@ -34,7 +34,7 @@ from ahoy_core.scene.scene import Scene, empty_scene, make_scene, read_splats
 from ahoy_core.scene.shot import Shot
 
 Progress = Callable[[int, int], None]
-VERSION = 1
+VERSION = 2  # of what a request's frames look like: those of an older one are not gone on with
 ROOM = "room"
 _AXES = {
     "x": (1.0, 0, 0),

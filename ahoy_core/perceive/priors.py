@@ -46,7 +46,6 @@ class JointRule:
 _WIDE = (2.6, 2.6, 2.6)
 _WIDE_LOW = (-2.6, -2.6, -2.6)
 
-# People who stand at ease have their heels 17 cm apart (McIlroy and Maki 1997), nearer than the packaged body at rest.
 # Spreads are of everyday movement, limits of joint anatomy, both rounded (e.g. knee 0 to 150 degrees, elbow 0 to 150).
 RULES: dict[str, JointRule] = {
     "spine_low": JointRule(
@@ -76,6 +75,7 @@ RULES: dict[str, JointRule] = {
         (("wrist.{side}", "finger3-1.{side}"), ("{side}_wrist", "{side}_middle1")),
         FORWARD, (0.3, 0.3, 0.3), (-0.8, -0.5, -1.0), (0.8, 0.5, 1.0),
     ),
+    # People at ease stand with their heels 17 cm apart (McIlroy and Maki 1997), nearer than the packaged body at rest.
     "hip": JointRule(
         (("upperleg01.{side}", "lowerleg01.{side}"), ("{side}_hip", "{side}_knee")),
         FORWARD, (0.7, 0.3, 0.3), (-0.7, -0.9, -1.0), (2.4, 0.9, 1.0), towards=(-0.02, 0.0, -1.0),

@@ -1,7 +1,7 @@
 """Avatars over the time that a shutter is open: posed at up to three moments, in between by a curve.
 
 A limb turns by a few degrees in an exposure: a parabola through three places of a Gaussian is within a hundredth of
-a pixel of its arc, and costs a fraction of posing it (tests/scene/test_references.py).
+a pixel of its arc, and costs a fraction of posing it (tests/scene/test_backdrop.py).
 """
 
 from __future__ import annotations

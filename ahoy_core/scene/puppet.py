@@ -93,10 +93,7 @@ class Puppet:
     @cached_property
     def _nearest(self) -> tuple[Tensor, Tensor]:
         """For each Gaussian: the three nearest of the sample [N,3], and their weights by inverse distance [N,3]."""
-        found = cKDTree(self.sample.means.numpy()).query(self.points.means.numpy(), min(3, len(self.sample)))
-        distance, rows = (torch.from_numpy(np.asarray(x).reshape(len(self.points), -1)) for x in found)
-        weights = 1 / (distance.float() + 1e-4)
-        return rows, weights / weights.sum(1, keepdim=True)
+        return nearest_three(self.points.means, self.sample.means, 1e-4)
 
     def spread(self, values: Tensor) -> Tensor:
         """Values of the sample [M,...] brought to all Gaussians [N,...]."""
@@ -107,3 +104,21 @@ class Puppet:
         """Positions and normals of the sample at each of these frames."""
         relative = self.relative(self.motion.pose[frames], self.motion.transl[frames])
         return [self.sample.posed(one) for one in relative]
+
+
+def nearest_three(places: Tensor, among: Tensor, soft: float) -> tuple[Tensor, Tensor]:
+    """The three nearest of M points to each place (all, of fewer), and weights by inverse distance.
+
+    Args:
+        places: [N,3] metres.
+        among: [M,3], M >= 1.
+        soft: metres added to every distance, so that a point in the same place is not all.
+
+    Returns:
+        Rows of `among` [N,min(3,M)] and weights that sum to 1.
+    """
+    count = min(3, len(among))
+    found = cKDTree(among.numpy()).query(places.numpy(), count)
+    distance, rows = (torch.from_numpy(np.asarray(x).reshape(len(places), count)) for x in found)
+    weights = 1 / (distance.float() + soft)
+    return rows, weights / weights.sum(1, keepdim=True)

@@ -19,7 +19,7 @@ from ahoy_core.splat import Window, footprints, hull
 # Moments that the planner looks at: enough for a walk to show every phase of a step.
 _MOMENTS = 6
 _REACH = 6.0  # pixels that Gaussians reach beyond their middles
-_NEAR = 0.05  # metres
+NEAR = 0.05  # metres: what is nearer to a camera is not in its picture
 
 
 @dataclass(frozen=True)
@@ -135,7 +135,7 @@ class Content:
             corners = []
             for surfaces in self.surfaces:
                 pixels, depths = cameras.project(surfaces[number][0])
-                corners.append(pixels[0][depths[0] > _NEAR])
+                corners.append(pixels[0][depths[0] > NEAR])
             found.append(_window_of(torch.cat(corners) if corners else torch.zeros(0, 2), cameras))
         return sorted(found, key=lambda w: 0 if w is None else w[2] * w[3])[len(found) // 2]
 
@@ -148,6 +148,19 @@ class Content:
     def avatar_gaussians(self) -> int:
         """Of all avatars together."""
         return sum(len(puppet.avatar) for puppet in self.puppets)
+
+
+def in_picture(cameras: Cameras, pixels: Tensor, depths: Tensor, near: float = NEAR) -> Tensor:
+    """Which [N] of the points that `Cameras.project` put at pixels [N,2] and depths [N] are in the picture.
+
+    Args:
+        cameras: Their size counts.
+        pixels: [N,2].
+        depths: [N] metres.
+        near: What is nearer to the camera is not in the picture, metres.
+    """
+    u, v = pixels.unbind(1)
+    return (depths > near) & (u >= 0) & (u < cameras.width) & (v >= 0) & (v < cameras.height)
 
 
 def _window_of(pixels: Tensor, cameras: Cameras) -> Window | None:

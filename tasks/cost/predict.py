@@ -9,6 +9,7 @@ from typing import Any
 
 from ahoy_core.cost.choose import Gains
 from ahoy_core.cost.work import FRAMES, KNOBS, PIXELS
+from ahoy_core.formats.npz import load_npz
 from ahoy_core.formats.video import scan
 from ahoy_core.formats.video_frames import Size, limited
 from ahoy_core.ingest import IngestConfig
@@ -42,6 +43,12 @@ class Clip:
         """Frames that ingest keeps, and the pixels of each."""
         size = limited(Size(self.width, self.height), config.max_size)
         return {FRAMES: len(select(self.pts, config)[1]), PIXELS: size.width * size.height}
+
+
+def ingested(ingest: Path) -> dict[str, int]:
+    """Frames that ingest kept, and the pixels of each, from its artifact."""
+    shape = load_npz(ingest / "frames.npz", ["frames"])["frames"].shape
+    return {FRAMES: int(shape[0]), PIXELS: int(shape[1] * shape[2])}
 
 
 def work_knobs(settings: Settings, clip: Mapping[str, int]) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from ahoy_core.scene.effects.contact_shadow import OCCLUDERS, Discs, carried, oc
 from ahoy_core.scene.effects.effect import Effect, Verdict
 from ahoy_core.scene.puppet import SAMPLE, Points, Puppet
 from ahoy_core.scene.scene import Scene
-from ahoy_core.scene.shot import Content
+from ahoy_core.scene.shot import Content, in_picture
 
 REACH = 0.5
 """Metres from an avatar within which surfaces are looked at; further ones are hardly in its shadow."""
@@ -91,15 +91,14 @@ def _judge(content: Content) -> Verdict:
     for puppet, surfaces in zip(content.puppets, content.surfaces, strict=True):
         points, normals = surfaces[number]
         pixels, depths = cameras.project(points)
-        u, v = pixels[0].unbind(1)
-        shown = (depths[0] > 0.05) & (u >= 0) & (u < cameras.width) & (v >= 0) & (v < cameras.height)
+        shown = in_picture(cameras, pixels[0], depths[0])
         shown &= ((cameras.centers[0] - points) * normals).sum(1) > 0
         if not bool(shown.any()):
             continue
         relative = puppet.relative(puppet.motion.pose[[frame]], puppet.motion.transl[[frame]])[0]
         loss = 1 - light_left(points, normals, nearby, carried([occluders(puppet)], [relative]))[shown]
         worst, share = max(worst, float(loss.max())), max(share, float((loss > _LEAST_LOSS).float().mean()))
-        tall = max(tall, float(v[shown].max() - v[shown].min()))
+        tall = max(tall, float(pixels[0, shown, 1].max() - pixels[0, shown, 1].min()))
     evidence = {"most_taken": round(worst, 3), "share": round(share, 4), "pixels": round(tall, 1)}
     if share < _LEAST_SHARE:
         return Verdict(False, "no part that is in the picture is close to a surface that the avatar shades", evidence)

@@ -3,7 +3,7 @@
 Every scene Gaussian nearby loses the share of its hemisphere, weighted by the cosine, that the avatar covers. The
 avatar is a few hundred discs carried by its joints; a disc facing a point covers A cos cos / (pi d² + A) of it
 (Bunnell, Dynamic Ambient Occlusion and Indirect Lighting, GPU Gems 2), and only those facing it count: of a closed body
-that is its outline, once. Reference: ray casting, tests/scene/test_contact_shadow.py.
+that is its outline, once. Reference: ray casting, tests/scene/test_references.py.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from ahoy_core.scene.color import to_linear, to_srgb
 from ahoy_core.scene.cost import Rates
 from ahoy_core.scene.effects.effect import Effect, Verdict
 from ahoy_core.scene.puppet import Points, Puppet
-from ahoy_core.scene.shot import Content
+from ahoy_core.scene.shot import Content, in_picture
 from ahoy_core.splat import Window, hull
 from ahoy_core.splat.gaussians import quats_to_rotations
 
@@ -160,8 +160,8 @@ def _ground_in_view(content: Content, places: Tensor, cameras: Cameras) -> tuple
     steps = torch.linspace(-0.5, 0.5, 9)
     grid = torch.stack([p.reshape(-1) for p in (*torch.meshgrid(steps, steps, indexing="ij"), torch.zeros(9, 9))], 1)
     pixels, depths = cameras.project(grid + foot * torch.tensor([1.0, 1.0, 0.0]))
-    u, v = pixels[0].unbind(1)
-    shown = (depths[0] > 0.05) & (u >= 0) & (u < cameras.width) & (v >= 0) & (v < cameras.height)
+    v = pixels[0, :, 1]
+    shown = in_picture(cameras, pixels[0], depths[0])
     if not bool(shown.any()):
         return 0.0, 0
     offset = content.scene.gaussians.means - foot * torch.tensor([1.0, 1.0, 0.0])

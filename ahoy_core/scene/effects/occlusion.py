@@ -12,7 +12,7 @@ from torch import Tensor
 from ahoy_core.conventions import Cameras
 from ahoy_core.scene.cost import Rates
 from ahoy_core.scene.effects.effect import Effect, Verdict
-from ahoy_core.scene.shot import Content
+from ahoy_core.scene.shot import NEAR, Content, in_picture
 from ahoy_core.splat.constants import ALPHA_CUTOFF
 
 # Pixels of a cell of the depth maps that are compared.
@@ -23,7 +23,6 @@ _LEAST = 0.002
 # Metres: nearer than this to the surface counts as touching, not as in front.
 _TOUCH = 0.01
 _FAINT = 0.05
-_NEAR = 0.05  # metres: what is nearer to the camera is not in the picture
 
 
 def hidden_share(content: Content) -> float:
@@ -51,7 +50,7 @@ def _nearest(means: Tensor, covars: Tensor, opacities: Tensor, cameras: Cameras)
         size = _CELL << level
         wide, high = -(-cameras.width // size), -(-cameras.height // size)
         flat = torch.full((high * wide,), torch.inf)
-        mine = (octave == level) & (depth > _NEAR)
+        mine = (octave == level) & (depth > NEAR)
         x, y = (u[mine] / size).floor().long(), (v[mine] / size).floor().long()
         inside = (x >= 0) & (x < wide) & (y >= 0) & (y < high)
         flat.scatter_reduce_(0, y[inside] * wide + x[inside], depth[mine][inside].float(), "amin")
@@ -66,7 +65,7 @@ def _circles(
     viewmat, K = cameras.viewmats[0].to(means), cameras.Ks[0].to(means)
     camera = means @ viewmat[:3, :3].T + viewmat[:3, 3]
     depth = camera[:, 2]
-    near = depth.clamp(min=_NEAR)
+    near = depth.clamp(min=NEAR)
     u, v = (K[i, i] * camera[:, i] / near + K[i, 2] for i in (0, 1))
     sigmas = (2 * torch.log((opacities / ALPHA_CUTOFF).clamp(min=1))).sqrt()
     extent = (covars.diagonal(dim1=1, dim2=2).sum(1).clamp(min=0) / 2).sqrt() * K[0, 0] / near
@@ -77,7 +76,7 @@ def _behind(places: Tensor, near: list[Tensor], cameras: Cameras) -> tuple[int, 
     """Of an avatar's cells: those that have something nearer, and all."""
     pixels, depths = cameras.project(places)
     u, v, depth = pixels[0, :, 0], pixels[0, :, 1], depths[0]
-    shown = (depth > _NEAR) & (u >= 0) & (u < cameras.width) & (v >= 0) & (v < cameras.height)
+    shown = in_picture(cameras, pixels[0], depth)
     if not bool(shown.any()):
         return 0, 0
     u, v, depth = u[shown], v[shown], depth[shown]

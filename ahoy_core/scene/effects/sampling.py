@@ -17,7 +17,7 @@ from ahoy_core.conventions import Cameras
 from ahoy_core.motion.time import slerp
 from ahoy_core.scene.cost import Rates
 from ahoy_core.scene.effects.effect import Effect, Verdict
-from ahoy_core.scene.shot import Content, Shot
+from ahoy_core.scene.shot import Content, Shot, in_picture
 
 MOST_SAMPLES = 10
 # Pixels: less blur than this is less than the rasterizer's own; between samples a gap this wide does not show.
@@ -86,8 +86,7 @@ def motion_pixels(content: Content) -> float:
                 continue
             cameras = content.shot.at(frame)
             (first, depth), (second, _) = (cameras.project(p) for p, _ in puppet.surface([frame, other]))
-            u, v = first[0].unbind(1)
-            shown = (depth[0] > 0.05) & (u >= 0) & (u < cameras.width) & (v >= 0) & (v < cameras.height)
+            shown = in_picture(cameras, first[0], depth[0])
             if bool(shown.any()):
                 way = (second[0] - first[0]).norm(dim=1)[shown]
                 worst = max(worst, float(way.quantile(0.99)))
@@ -124,8 +123,8 @@ def lens_pixels(content: Content) -> float:
     clouds += [surfaces[0][0] for surfaces in content.surfaces]
     for cloud in clouds:
         pixels, depths = cameras.project(cloud)
-        u, v, depth = pixels[0, :, 0], pixels[0, :, 1], depths[0]
-        shown = (depth > 0.2) & (u >= 0) & (u < cameras.width) & (v >= 0) & (v < cameras.height)
+        depth = depths[0]
+        shown = in_picture(cameras, pixels[0], depth, near=0.2)
         if bool(shown.any()):
             circle = shot.aperture * float(cameras.Ks[0, 0, 0]) * (1 / depth[shown] - 1 / at).abs()
             worst = max(worst, float(circle.quantile(0.98)))

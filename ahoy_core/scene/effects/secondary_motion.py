@@ -1,7 +1,7 @@
 """Secondary motion: hair and wide clothes lag behind the body and swing on after it stops.
 
 What stands off the body's surface hangs on it by a damped spring: for the lag u of a place p that the skeleton carries,
-u'' + 2 zeta omega u' + omega² u = -p'', solved exactly for an acceleration that is constant over a frame. A lag is
+u'' + 2 zeta omega u' + omega² u = -p'', solved exactly for a path that is straight and even within a frame. A lag is
 scaled by how loose the place is and never takes it to the body. One frequency and one damping stand for all cloth and
 hair, which is a guess. Reference: the oscillator's closed form, tests/scene/test_secondary_motion.py.
 """
@@ -14,13 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from scipy.linalg import expm
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from ahoy_core.scene.cost import Rates
 from ahoy_core.scene.effects.effect import Effect, Verdict
-from ahoy_core.scene.puppet import Puppet
-from ahoy_core.scene.shot import Content
+from ahoy_core.scene.puppet import Puppet, nearest_three
+from ahoy_core.scene.shot import NEAR, Content
 
 FREQUENCY = 2.2
 """Hertz, of a coat's hem or long hair left to swing."""
@@ -99,11 +98,7 @@ def swing_of(puppet: Puppet) -> Swing | None:
     off = (means - puppet.avatar.template.means).norm(dim=1)[chosen]
     length = lags.norm(dim=2, keepdim=True)
     lags = lags * (_MOST * off[:, None] / length.clamp(min=1e-9)).clamp(max=1)
-    count = min(3, len(chosen))
-    distance, nearest = cKDTree(means[chosen].numpy()).query(means[rows].numpy(), count)
-    weights = 1 / (torch.from_numpy(np.asarray(distance).reshape(len(rows), count)).float() + 1e-3)
-    nearest = torch.from_numpy(np.asarray(nearest).reshape(len(rows), count))
-    return Swing(rows, nearest, weights / weights.sum(1, keepdim=True), lags)
+    return Swing(rows, *nearest_three(means[rows], means[chosen], 1e-3), lags)
 
 
 def _judge(content: Content) -> Verdict:
@@ -130,7 +125,7 @@ def _lag_pixels(content: Content, puppet: int) -> float:
         cameras = content.shot.at(frame)
         place = content.surfaces[puppet][number][0].mean(0)
         depth = float(cameras.project(place[None]).depths[0, 0])
-        if depth > 0.05:
+        if depth > NEAR:
             worst = max(worst, float(swing.lags[frame].norm(dim=1).max()) * float(cameras.Ks[0, 0, 0]) / depth)
     return worst
 
