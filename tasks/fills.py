@@ -20,6 +20,7 @@ import yaml
 from pydantic import TypeAdapter, ValidationError
 
 from ahoy_core.body.load import PACKAGED
+from ahoy_core.models import shelf
 from ahoy_core.models.adapter import OWN_WEIGHTS, Fill
 from ahoy_core.models.catalogue import adapter, check_fills
 from ahoy_core.models.checkpoint import device_of
@@ -91,19 +92,23 @@ class Fills:
         return str(fill.path)
 
     def preload(self) -> list[str]:
-        """Load the models that work on the CPU, for a process that others are forked from; returns their roles.
+        """Read models for a process that others are forked from; returns their roles.
 
-        A GPU's context does not survive a fork, so its models are loaded elsewhere; but their files are hashed here
-        once, for all forks.
+        Those of the CPU are shared as they are. A GPU's context does not survive a fork: its networks are read into
+        the CPU's memory, and each fork that uses them copies them to its GPU. All files are hashed here, once.
 
         Raises:
             ModelError: one cannot be loaded, or its files are not there.
         """
-        roles = [role for role, fill in self.chosen.items() if not fill.command and fill.device == "cpu"]
-        for role in roles:
-            self.get(role)
+        fills = {role: fill for role, fill in self.chosen.items() if not fill.command and fill.warm}
+        for role, fill in fills.items():
+            if device_of(fill).type == "cpu":
+                self.get(role)
+            else:
+                with shelf.filling():
+                    adapter(role, fill.fill).open(fill)
         self.filled({}, tuple(self.chosen))
-        return roles
+        return list(fills)
 
     def to_json(self) -> str:
         """Text for `ENVIRONMENT` in another process."""

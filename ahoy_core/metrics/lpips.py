@@ -18,7 +18,7 @@ from torch.nn.functional import max_pool2d, relu
 
 from ahoy_core.metrics.stlpips import MIN_SIDE, SCALE, SHIFT, check_pictures, weighted_difference
 from ahoy_core.models.adapter import OWN_WEIGHTS, Adapter, Fill
-from ahoy_core.models.checkpoint import device_of, read_state, take
+from ahoy_core.models.checkpoint import loading_device, read_state, take
 
 
 @dataclass(frozen=True)
@@ -146,7 +146,7 @@ def load_lpips(fill: Fill, adapter: Adapter, backbone: Backbone) -> Lpips:
     convs = {f"{c.name}.{part}": getattr(conv, part) for c, conv in _convs(network) for part in ("weight", "bias")}
     _fill(convs, body, adapter)
     _fill({f"lin{n}.model.1.weight": head for n, head in enumerate(network.heads)}, heads, adapter)
-    return network.to(device_of(fill)).eval()
+    return network.to(loading_device(fill)).eval()
 
 
 def _convs(network: Lpips) -> list[tuple[Conv, nn.Module]]:

@@ -33,6 +33,7 @@ class Fill(BaseModel):
             say so.
         command: an external command, as a list of words (no shell reads it).
         timeout_s: seconds that one call of the command may take.
+        warm: a worker reads it once, before its runs are forked, and keeps it in the machine's memory for them.
         options: knobs of the adapter.
     """
 
@@ -46,6 +47,7 @@ class Fill(BaseModel):
     own_weights: bool = False
     command: tuple[str, ...] = ()
     timeout_s: float = Field(default=3600.0, gt=0)
+    warm: bool = True
     options: dict[str, Any] = Field(default_factory=dict)
 
     @model_validator(mode="after")

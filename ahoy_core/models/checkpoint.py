@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from ahoy_core.models.errors import CheckpointError
 from ahoy_core.models.hashes import sha256_of
+from ahoy_core.models.shelf import is_filling, network
 
 if TYPE_CHECKING:
     from ahoy_core.models.adapter import Adapter, DType, Fill
@@ -72,6 +73,12 @@ def pretrained(cls: Any, folder: Path, fill: Fill, adapter: Adapter, **more: Any
     Raises:
         CheckpointError: naming the missing weights.
     """
+    kind = f"{cls.__qualname__} {sorted((name, str(value)) for name, value in more.items())}"
+    placed: nn.Module = network(folder, kind, device_of(fill), lambda: _complete(cls, folder, adapter, more))
+    return placed
+
+
+def _complete(cls: Any, folder: Path, adapter: Adapter, more: Mapping[str, Any]) -> nn.Module:
     kwargs = {"local_files_only": True, "use_safetensors": True, "output_loading_info": True, **more}
     try:
         model, info = cls.from_pretrained(str(folder), **kwargs)
@@ -85,8 +92,8 @@ def pretrained(cls: Any, folder: Path, fill: Fill, adapter: Adapter, **more: Any
             f"{adapter.label}: {folder} lacks {_some(sorted(bad))} of {cls.__name__}; it is another model's, or cut "
             f"short: {adapter.how_to_get()}"
         )
-    placed: nn.Module = model.to(device_of(fill)).eval().requires_grad_(False)
-    return placed
+    whole: nn.Module = model.eval().requires_grad_(False)
+    return whole
 
 
 def device_of(fill: Fill) -> torch.device:
@@ -100,6 +107,11 @@ def device_of(fill: Fill) -> torch.device:
     if fill.device.startswith("cuda") and not torch.cuda.is_available():
         raise CheckpointError(f"expected a GPU for device {fill.device!r}, got none here; say device: cpu or auto")
     return torch.device(fill.device)
+
+
+def loading_device(fill: Fill) -> torch.device:
+    """Where what is read goes: `device_of`, but the CPU while models are being read for forks."""
+    return torch.device("cpu") if is_filling() else device_of(fill)
 
 
 def dtype_of(fill: Fill, adapter: Adapter) -> torch.dtype:

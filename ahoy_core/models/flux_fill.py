@@ -13,6 +13,7 @@ from ahoy_core.models.adapter import Adapter, Fill
 from ahoy_core.models.checkpoint import device_of, dtype_of, pretrained, short
 from ahoy_core.models.errors import CheckpointError
 from ahoy_core.models.offline import stay_offline
+from ahoy_core.models.shelf import is_filling
 
 PROMPT: Final = "a full-body photo of a person, plain grey background"
 
@@ -146,7 +147,7 @@ def load_flux_fill(fill: Fill, adapter: Adapter) -> FluxFill:
         transformer=transformer,
     )
     pipeline.set_progress_bar_config(disable=True)
-    if options.offload:
+    if options.offload and not is_filling():
         pipeline.enable_model_cpu_offload(device=device_of(fill))
     return FluxFill(pipeline, options)
 

@@ -18,7 +18,7 @@ from torch.nn.functional import interpolate
 
 from ahoy_core.models.adapter import Adapter, Fill
 from ahoy_core.models.boxes import box_overlap, mask_bounds
-from ahoy_core.models.checkpoint import device_of, dtype_of, in_batches, pretrained
+from ahoy_core.models.checkpoint import dtype_of, in_batches, loading_device, pretrained
 from ahoy_core.models.errors import CheckpointError
 from ahoy_core.models.offline import stay_offline
 
@@ -187,7 +187,7 @@ def load_sam3(fill: Fill, adapter: Adapter) -> Sam3Image | Sam3Video:
     options = Sam3Options(**fill.options)
     video = options.mode == "video"
     model = pretrained(Sam3VideoModel if video else Sam3Model, fill.path, fill, adapter, dtype=dtype_of(fill, adapter))
-    ids, attention = (part.to(device_of(fill)) for part in _tokens(fill.path, options.prompt, adapter))
+    ids, attention = (part.to(loading_device(fill)) for part in _tokens(fill.path, options.prompt, adapter))
     return Sam3Video(model, ids, attention, options) if video else Sam3Image(model, ids, attention, options)
 
 

@@ -14,6 +14,7 @@ from ahoy_core.models.adapter import Adapter, Fill
 from ahoy_core.models.checkpoint import device_of, short
 from ahoy_core.models.errors import CheckpointError
 from ahoy_core.models.hashes import sha256_of
+from ahoy_core.models.shelf import network
 
 
 def load_script(fill: Fill, adapter: Adapter, methods: Sequence[str] = ("forward",), file: Path | None = None) -> Any:
@@ -32,7 +33,7 @@ def load_script(fill: Fill, adapter: Adapter, methods: Sequence[str] = ("forward
     assert path is not None
     define_nms()
     try:
-        model = torch.jit.load(str(path), map_location=device_of(fill))
+        model = network(path, "TorchScript", device_of(fill), lambda: torch.jit.load(str(path), map_location="cpu"))
     except Exception as error:  # the reader raises RuntimeError, ValueError and others, by where the file breaks
         raise CheckpointError(
             f"{adapter.label}: {path} cannot be read as TorchScript ({short(error)}, {path.stat().st_size} bytes, "

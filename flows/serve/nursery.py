@@ -185,16 +185,17 @@ def _exactly(connection: socket.socket, size: int) -> bytes:
 
 
 def load_models() -> None:
-    """Load once, for all runs to come, the models of `roles.yaml` that work on the CPU; forks share their memory.
+    """Read once, for all runs to come, the models of `roles.yaml`; forks share their memory.
 
-    One thread loads: OpenMP's threads do not survive a fork. What cannot be loaded is the run's to complain of, whose
-    stage then says why.
+    Nothing may open a GPU here: whether there is one is asked of NVML, which forks survive. One thread reads: OpenMP's
+    threads do not survive a fork. What cannot be read is the run's to complain of, whose stage then says why.
     """
     import torch
 
     from ahoy_core.models.errors import ModelError
     from tasks.fills import fills_from_environment
 
+    os.environ["PYTORCH_NVML_BASED_CUDA_CHECK"] = "1"
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
