@@ -30,15 +30,17 @@ def list_() -> None:
     table = Table("model", "role", "source", "size", "licence", "sha256", "state")
     for status in model_files.verify():
         model = status.model
-        source = f"{model.wheel.package} {model.wheel.version}"
         size = f"{model.size / 2**20:.1f} MB"
-        table.add_row(model.name, model.role, source, size, model.licence, model.sha256[:12], status.state)
+        state = "optional" if model.optional and status.state == "missing" else status.state
+        table.add_row(model.name, model.role, model.archive.label, size, model.licence, model.sha256[:12], state)
     console.print(table)
     console.print(f"kept in {model_files.cache_dir()} (AHOY_MODELS chooses another folder)", soft_wrap=True)
 
 
 @app.command()
-def pull() -> None:
+def pull(
+    names: Annotated[list[str] | None, typer.Argument(help="optional models to fetch too")] = None,
+) -> None:
     """Fetch what is missing, once; refuse what does not match its hash."""
     columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TransferSpeedColumn())
     try:
@@ -48,7 +50,7 @@ def pull() -> None:
             def show(done: int, total: int, note: str) -> None:
                 bars.update(bar, completed=done, total=total, description=note)
 
-            paths = model_files.pull(show)
+            paths = model_files.pull(show, names or ())
     except model_files.ModelFileError as error:
         console.print("[red]error:[/]", escape(str(error)), highlight=False, soft_wrap=True)
         raise typer.Exit(EXIT_BAD_MODEL) from None
@@ -58,7 +60,10 @@ def pull() -> None:
 @app.command()
 def verify() -> None:
     """Hash every model file; the exit status says whether all are as they should be."""
-    bad = [status for status in model_files.verify() if status.state != "ok"]
+    known = model_files.verify()
+    bad = [
+        each for each in known if each.state == "wrong hash" or (each.state == "missing" and not each.model.optional)
+    ]
     for status in bad:
         console.print(f"{status.model.name}: {status.state} ({status.path}); run `ahoy models pull`", soft_wrap=True)
     if bad:

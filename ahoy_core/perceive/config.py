@@ -6,6 +6,8 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from ahoy_core.perceive.networks import FULL, Landmarker
+
 
 class KnownCamera(BaseModel):
     """The still camera that took the video, where it is known.
@@ -27,7 +29,8 @@ class PerceiveConfig(BaseModel):
     """Knobs of the stage.
 
     Attributes:
-        model: the landmark network that fills the roles pose and mask.
+        model: the landmark network that fills the roles pose and mask; all but the full one are optional downloads
+            (`ahoy models pull pose_landmark_heavy`).
         passes: readings averaged per frame: 1 forward, 2 also mirrored, 3 also backward in time, 4 backward mirrored
             too.
         stride: look at every stride-th frame; the others get poses in between and count as unused.
@@ -43,7 +46,7 @@ class PerceiveConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    model: Literal["pose_landmark_full"] = "pose_landmark_full"
+    model: Landmarker = FULL
     passes: Literal[1, 2, 3, 4] = 2
     stride: int = Field(default=1, ge=1, le=100)
     subject: int | None = Field(default=None, ge=0)

@@ -1,4 +1,4 @@
-"""The two TFLite networks of BlazePose, as functions of arrays.
+"""The TFLite networks of BlazePose and its face mesh, as functions of arrays.
 
 Bazarevsky et al., "BlazePose: On-device Real-time Body Pose tracking" (2020); GHUM-trained 3D variant: Grishchenko et
 al. (2022).
@@ -11,10 +11,10 @@ import os
 import sys
 import tempfile
 import threading
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +28,15 @@ N_RAW = 39  # 33 landmarks of the body and six that only steer the crop of the n
 STDERR = 2  # the descriptor
 _STDERR = threading.Lock()
 BANNER = b"INFO: Created TensorFlow Lite XNNPACK delegate for CPU."
-REQUIRED = ("pose_detection", "pose_landmark_full", "face_landmark")
+Landmarker = Literal[
+    "pose_landmark_lite", "pose_landmark_full", "pose_landmark_heavy", "pose_landmark_full+pose_landmark_heavy"
+]
+FULL: Final[Landmarker] = "pose_landmark_full"
+
+
+def files_of(landmarker: Landmarker) -> tuple[str, ...]:
+    """Names of the networks that are needed: the detector's, one or two of landmarks, the face's."""
+    return ("pose_detection", *landmarker.split("+"), "face_landmark")
 
 
 @dataclass(frozen=True)
@@ -101,24 +109,27 @@ class _Network:
 
 
 class Networks:
-    """Detector and landmark network, loaded from files.
+    """Detector, landmark and face network, loaded from files.
 
     Args:
-        paths: file of each network in `REQUIRED`, by name.
+        paths: file of each network in `files_of(landmarker)`, by name.
         num_threads: threads of each interpreter.
+        landmarker: which landmark network; of two, the mean of what they say, with the first one's mask (the heavy
+            network's is worse).
 
     Raises:
         ValueError: a network is not among `paths`, or `num_threads` is below 1.
     """
 
-    def __init__(self, paths: Mapping[str, Path], num_threads: int = 1) -> None:
-        missing = [name for name in REQUIRED if name not in paths]
+    def __init__(self, paths: Mapping[str, Path], num_threads: int = 1, landmarker: Landmarker = FULL) -> None:
+        names = files_of(landmarker)
+        missing = [name for name in names if name not in paths]
         if missing:
-            raise ValueError(f"expected the files of {', '.join(REQUIRED)}, got none for {', '.join(missing)}")
+            raise ValueError(f"expected the files of {', '.join(names)}, got none for {', '.join(missing)}")
         if num_threads < 1:
             raise ValueError(f"expected num_threads of at least 1, got {num_threads}")
         self._detector: Any = _Network(paths["pose_detection"], num_threads)
-        self._landmarker: Any = _Network(paths["pose_landmark_full"], num_threads)
+        self._landmarkers: list[Any] = [_Network(paths[name], num_threads) for name in landmarker.split("+")]
         self._face: Any = _Network(paths["face_landmark"], num_threads)
 
     def detect(self, image: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -135,17 +146,7 @@ class Networks:
 
     def landmarks(self, image: NDArray[np.float32]) -> RawLandmarks:
         """Run the landmark network on one upright crop, [256,256,3] sRGB in [0,1]."""
-        out = self._landmarker(image)
-        rows = out["Identity"].reshape(N_RAW, 5)
-        return RawLandmarks(
-            points=rows[:, :3],
-            visibility=sigmoid(rows[:, 3]),
-            presence=sigmoid(rows[:, 4]),
-            world=out["Identity_4"].reshape(N_RAW, 3),
-            score=float(out["Identity_1"][0]),
-            mask=sigmoid(out["Identity_2"][..., 0]),
-            heatmap=out["Identity_3"],
-        )
+        return _mean([_raw(network(image)) for network in self._landmarkers])
 
     def face(self, image: NDArray[np.float32]) -> tuple[NDArray[np.float32], float]:
         """Run the face network on one upright crop, [192,192,3] sRGB in [0,1].
@@ -155,6 +156,31 @@ class Networks:
         """
         points, score = sorted(self._face(image).values(), key=lambda values: -values.size)
         return points.reshape(N_FACE, 3), float(sigmoid(score.reshape(-1))[0])
+
+
+def _raw(out: Mapping[str, NDArray[np.float32]]) -> RawLandmarks:
+    rows = out["Identity"].reshape(N_RAW, 5)
+    return RawLandmarks(
+        points=rows[:, :3],
+        visibility=sigmoid(rows[:, 3]),
+        presence=sigmoid(rows[:, 4]),
+        world=out["Identity_4"].reshape(N_RAW, 3),
+        score=float(out["Identity_1"][0]),
+        mask=sigmoid(out["Identity_2"][..., 0]),
+        heatmap=out["Identity_3"],
+    )
+
+
+def _mean(answers: Sequence[RawLandmarks]) -> RawLandmarks:
+    """Field by field, with the first answer's mask."""
+    if len(answers) == 1:
+        return answers[0]
+    means: dict[str, Any] = {
+        each.name: np.mean([getattr(answer, each.name) for answer in answers], axis=0, dtype=np.float32)
+        for each in fields(RawLandmarks)
+        if each.name not in ("score", "mask")
+    }
+    return RawLandmarks(**means, score=float(np.mean([a.score for a in answers])), mask=answers[0].mask)
 
 
 def sigmoid(x: NDArray[np.float32]) -> NDArray[np.float32]:

