@@ -14,7 +14,7 @@ from ahoy_core.prior.corpus import wardrobe
 from ahoy_core.prior.corpus.poses import ACTIONS, HELD_OUT_ACTIONS
 from ahoy_core.prior.corpus.shards import CLIPS
 
-_PARTS = ("autoencoder", "flow")
+_PARTS = ("autoencoder", "flow", "decoder")
 
 _TEXT = """# The embedded prior
 
@@ -29,7 +29,7 @@ motion, and what was seen of a person, it proposes what was not seen. It knows n
   the meshes {held_suits}, {held_shoes}, {held_hair}; the textures of {untextured}; the actions {held_actions}.
   In no split, because the development captures wear them: {never}.
 - **Model**: {model}.
-- **Training**: {training}. Seeds 0 (autoencoder) and 1 (flow).
+- **Training**: {training}. Seeds 0 (autoencoder, decoder) and 1 (flow).
 - **Limits**: one person over grey at 128 x 64; prints on an unseen back cannot be known; faces are rendered
   ones: it must not be used to invent a face. What it makes is synthetic media and is labelled so downstream.
 
@@ -51,7 +51,8 @@ def write_card(folder: Path, corpus: Path, figures: Mapping[str, Any]) -> Path:
         The card.
     """
     out = folder / "prior"
-    curves = {part: pq.read_table(folder / part / "curve.parquet").to_pylist() for part in _PARTS}
+    found = {part: folder / part / "curve.parquet" for part in _PARTS}
+    curves = {part: pq.read_table(path).to_pylist() for part, path in found.items() if path.exists()}
     _plot(curves, out / "curves.png")
     first = next(iter(sorted(corpus.glob("train-*.safetensors"))), None)
     text = _TEXT.format(

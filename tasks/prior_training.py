@@ -57,10 +57,12 @@ def train_autoencoder(
         schedule: times and rates.
         note: sees every row of the curve.
         batch: crops a step.
-        decoder_only: leave the encoder, and so the latents that a flow was trained on, as they are.
+        decoder_only: leave the encoder, and so the latents that a flow was trained on, as they are; the prior that is
+            there gets the new decoder.
     """
     from ahoy_core.prior.autoencoder import FrameAutoencoder
     from ahoy_core.prior.corpus.shards import shards
+    from ahoy_core.prior.format import save_autoencoder
     from ahoy_core.prior.train.frames import (
         FramePool,
         autoencoder_loss,
@@ -101,7 +103,9 @@ def train_autoencoder(
         if not decoder_only:
             mean, std = latent_statistics(model, corpus)
             model.register_to_config(latents_mean=mean, latents_std=std)
-        model.save_pretrained(folder / AUTOENCODER)
+        save_autoencoder(folder / AUTOENCODER, model)
+        if decoder_only and (folder / "prior").exists():
+            save_autoencoder(folder / "prior" / "vae", model)
 
 
 def encode_corpus(corpus: Path, folder: Path, note: Callable[[str], None], every: int = 1) -> None:

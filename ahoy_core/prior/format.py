@@ -44,6 +44,14 @@ class Components:
     expand_timesteps: bool
 
 
+def save_autoencoder(folder: Path, vae: FrameAutoencoder) -> None:
+    """Writes an autoencoder, without the path that it was read from, which diffusers would note down."""
+    vae.save_pretrained(folder)
+    config = folder / "config.json"
+    kept = {name: value for name, value in json.loads(config.read_text()).items() if name != "_name_or_path"}
+    config.write_text(json.dumps(kept, indent=2) + "\n")
+
+
 def save_prior(folder: Path, transformer: Any, vae: FrameAutoencoder, text_encoder: Any, tokenizer: Any) -> None:
     """Writes an embedded prior: one transformer, one timestep a token.
 
@@ -58,7 +66,7 @@ def save_prior(folder: Path, transformer: Any, vae: FrameAutoencoder, text_encod
 
     folder.mkdir(parents=True, exist_ok=True)
     transformer.save_pretrained(folder / "transformer")
-    vae.save_pretrained(folder / "vae")
+    save_autoencoder(folder / "vae", vae)
     text_encoder.save_pretrained(folder / "text_encoder")
     tokenizer.save_pretrained(folder / "tokenizer")
     FlowMatchEulerDiscreteScheduler(**_SCHEDULER).save_pretrained(folder / "scheduler")

@@ -194,12 +194,15 @@ def load_models() -> None:
 
     from ahoy_core.models.errors import ModelError
     from tasks.fills import fills_from_environment
+    from tasks.prior_folder import preload_prior
 
     os.environ["PYTORCH_NVML_BASED_CUDA_CHECK"] = "1"
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        fills_from_environment().preload()
+        fills = fills_from_environment()
+        fills.preload()
+        preload_prior(fills)
     except ModelError as error:
         print(f"not loaded beforehand: {error}", file=sys.stderr)
     finally:

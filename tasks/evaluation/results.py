@@ -132,9 +132,10 @@ def remarks(cells: Sequence[Cell]) -> list[str]:
     trained = [cell for cell in cells if cell.ref and "prior" in cell.facts]
     if trained and not any(cell.facts["prior"] for cell in trained):
         said.append(
-            "- No video prior (paper section 3.2) has trained weights here, so no row is made with one: `full` is the "
-            "full avatar on the fallback (coarse renders as they are). `A` against `full` therefore shows what the "
-            "full avatar's training adds, not what the prior adds, and `full` and `B2` train on the same data."
+            "- No video prior (paper section 3.2) was used in any row: switched off, or the symmetric fill was closer "
+            "to what each video's self-check hid. `full` is the full avatar on the fallback (coarse renders as they "
+            "are). `A` against `full` therefore shows what the full avatar's training adds, not what the prior adds, "
+            "and `full` and `B2` train on the same data."
         )
     for capture in dict.fromkeys(cell.capture for cell in trained):
         by_avatar: dict[str, list[str]] = {}

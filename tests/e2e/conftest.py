@@ -15,6 +15,7 @@ from tasks import model_files
 
 # The real stages at a size that takes seconds: the knobs that set it, not another code path.
 SMALL = (
+    "prior=none",  # tests/e2e/test_prior_run.py asks one
     "ingest.max_frames=6",
     "ingest.max_size=256",
     "texture.atlas_size=96",
@@ -58,7 +59,9 @@ class SmallRun:
 @pytest.fixture(scope="session")
 def models() -> None:
     """Skips where the landmark networks have not been pulled."""
-    missing = [status.model.name for status in model_files.verify() if status.state != "ok"]
+    missing = [
+        status.model.name for status in model_files.verify() if status.state != "ok" and not status.model.optional
+    ]
     if missing:
         pytest.skip(f"needs the networks {', '.join(missing)}: run `ahoy models pull`")
 

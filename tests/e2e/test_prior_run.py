@@ -43,6 +43,15 @@ def test_without_a_prior_its_stages_are_skipped_with_the_reason(small_run: Small
     assert "switched off (prior=none)" in page
 
 
+def test_the_packaged_prior_is_asked_where_a_run_says_nothing_else(small_run: SmallRun) -> None:
+    small_run.again(knobs=["prior=packaged", "complete.regions=1"])
+    complete = next(row for row in _latest(small_run) if row["stage"] == "complete")
+    manifest, folder = _manifest(small_run, complete)
+    assert "embedded prior" in manifest.roles["video"]["name"]
+    errors = json.loads((folder / "complete.json").read_text())["errors"]
+    assert set(errors) == {"symmetric fill", "prior, clean-up", "prior, inversion"}
+
+
 def test_a_prior_that_loses_its_self_check_changes_nothing(small_run: SmallRun, embedded_folder: Path) -> None:  # noqa: F811
     small_run.again(knobs=["prior=none"])
     before = {row["stage"]: row["key"] for row in _latest(small_run)}

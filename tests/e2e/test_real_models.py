@@ -36,7 +36,8 @@ KNOBS = {
 }
 # What makes the stages of section 3.2 run whoever wins the self-check, at a size that takes seconds.
 ASKED = (
-    "ingest.max_frames=4", "complete.believe=prior", "complete.regions=1", "identity.steps=2", "identity.frames=2",
+    "prior=packaged", "ingest.max_frames=4",
+    "complete.believe=prior", "complete.regions=1", "identity.steps=2", "identity.frames=2",
     "motions.limit=1", "motions.frames=5", "hallucinate.inversion.steps=1",
 )  # fmt: skip
 

@@ -53,7 +53,7 @@ def test_the_report_is_one_file_that_asks_the_network_for_nothing(small_run: Sma
         "Synthetic media",
         "was invented",
         "turntable",
-        "no trained prior ships",
+        "switched off (prior=none)",
         "The full avatar",
         "ablation B2",
         "peak memory",
