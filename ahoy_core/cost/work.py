@@ -95,7 +95,7 @@ WORK: Mapping[str, Callable[[Knobs], dict[str, float]]] = {
     "animate": _animate,
     "report": lambda k: {"once": 1.0},
 }
-"""Terms of each stage; stages that are not here ask a trained prior, and nothing was measured of them."""
+"""Terms of each stage; stages that are not here ask the prior, and are not swept."""
 
 KNOBS: tuple[str, ...] = (
     *(FRAMES, PIXELS),
