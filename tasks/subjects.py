@@ -50,4 +50,4 @@ def _roles(config: SubjectsConfig) -> Mapping[str, Role]:
     return {"pose": networks(files_of(FULL))}
 
 
-SUBJECTS = Stage("subjects", 1, SubjectsConfig, ("ingest",), run_subjects, _roles)
+SUBJECTS = Stage("subjects", 2, SubjectsConfig, ("ingest",), run_subjects, _roles)

@@ -11,12 +11,14 @@ from numpy.typing import NDArray
 
 from ahoy_core.perceive.appearance import appearance
 from ahoy_core.perceive.crop import Roi, sample
-from ahoy_core.perceive.detection import Detection, detect, merge
+from ahoy_core.perceive.detection import NMS_IOU, Detection, box_iou, detect, merge
 from ahoy_core.perceive.networks import Networks
-from ahoy_core.perceive.tracking import Track, link
+from ahoy_core.perceive.tracking import Track, apart, link
 
 TILES_EVERY = 4  # frames: in between, people found on a tile are followed by the landmark network
 TILED_FROM = 1.3  # of the long over the short side: wider pictures are also searched in squares
+SAME_PLACE = 0.12  # of a crop, between the centres of two crops of one person
+SAME_SIZE = 1.3  # and the larger of the two over the smaller
 WORTH = 0.2  # of the most prominent person's prominence: others below are passers-by
 TILE = 256  # pixels of a picture on the sheet
 
@@ -36,7 +38,7 @@ def find_people(
     for t, frame in enumerate(frames):
         found = detect(networks, frame)
         if t % TILES_EVERY == 0:
-            found = merge(found + _on_tiles(networks, frame))
+            found = merge(found + [d for d in _on_tiles(networks, frame) if not _seen_already(d, found)])
         detections.append(found)
         looks.append([appearance(frame, d) for d in found])
         if tick:
@@ -57,6 +59,16 @@ def _on_tiles(networks: Networks, frame: NDArray[np.uint8]) -> list[Detection]:
         for d in detect(networks, np.ascontiguousarray(frame[y : y + side, x : x + side])):
             found.append(Detection(d.box + np.tile(shift, 2), d.keypoints + shift, d.score))
     return found
+
+
+def _seen_already(on_tile: Detection, found: Sequence[Detection]) -> bool:
+    """Whether the whole frame showed the same person with a head of another size, which `merge` would not join."""
+    return any(
+        box_iou(on_tile.box, other.box) <= NMS_IOU
+        and apart(on_tile.roi, other.roi) < SAME_PLACE
+        and abs(float(np.log(on_tile.roi.size / other.roi.size))) < float(np.log(SAME_SIZE))
+        for other in found
+    )
 
 
 @dataclass(frozen=True)

@@ -186,11 +186,11 @@ def belongs_to_another(roi: Roi, subject: Track, others: Sequence[Track], frame:
     Who passes in front takes the landmark network's eye even in the subject's own crop.
     """
     own = subject.rois.get(frame)
-    away = np.inf if own is None else _apart(roi, own)
-    near = [_apart(roi, t.rois[frame]) for t in others if t is not subject and frame in t.rois]
+    away = np.inf if own is None else apart(roi, own)
+    near = [apart(roi, t.rois[frame]) for t in others if t is not subject and frame in t.rois]
     return any(distance < SLIPPED and distance + TELLING < away for distance in near)
 
 
-def _apart(roi: Roi, of: Roi) -> float:
+def apart(roi: Roi, of: Roi) -> float:
     """Distance of two crops' centres, in sides of the second."""
     return float(np.hypot(roi.cx - of.cx, roi.cy - of.cy)) / of.size

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from ahoy_core.perceive import people
 from ahoy_core.perceive.appearance import appearance, unlikeness
 from ahoy_core.perceive.crop import Roi
 from ahoy_core.perceive.detection import Detection
@@ -122,3 +123,21 @@ def test_the_sheet_shows_a_row_for_each_person_and_passers_by_are_not_worth_an_a
     assert worthwhile(people) == [0]
     sheet = subject_sheet(np.zeros((48, 100, 200, 3), np.uint8), people)
     assert sheet.shape == (512, 1024, 3) and sheet.dtype == np.uint8
+
+
+def test_somebody_whom_a_tile_shows_with_a_smaller_head_is_not_somebody_else(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a wide picture the whole frame and a tile see the same person, whose heads overlap too little to be merged."""
+    width, height = 200, 100
+    small_head = np.array([58.5, 10.0, 61.5, 14.0])
+
+    def seen(networks: object, frame: NDArray[np.uint8]) -> list[Detection]:
+        if frame.shape[1] == width:
+            return [person(60.0)]
+        there = Detection(small_head, person(60.0, half=18.0).keypoints, 0.8)
+        return [there] if frame[0, 0, 0] == 0 else [person(70.0)]  # the tile on the right shows another, at 170
+
+    monkeypatch.setattr(people, "detect", seen)
+    frames = np.zeros((8, height, width, 3), np.uint8)
+    frames[:, :, width - height :] = 1
+    found = people.find_people(None, frames, np.zeros(8, int))  # type: ignore[arg-type]
+    assert sorted(round(track.rois[0].cx) for track in found) == [60, 170]
