@@ -7,7 +7,7 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from flows.lists import ListEntry, VideoList, VideoOptions, read_list
@@ -153,8 +153,14 @@ def test_what_the_download_archive_names_is_left_out(folder: Path) -> None:
 
 
 @given(st.lists(st.text(st.characters(exclude_characters="\n"), max_size=60), max_size=20))
+@example(["\0"])
 def test_no_text_breaks_the_reader_and_every_line_is_accounted_for(content: list[str]) -> None:
     data = "\n".join(content).encode("utf-8", "surrogatepass")
+    head = data[:4096]
+    if head.count(0) > len(head) // 10:
+        with pytest.raises(ListError, match="got binary data"):
+            read_list("-", POLICY, stdin=[data])
+        return
     videos = read_list("-", POLICY, stdin=[data])
     seen = [entry.line for entry in videos.entries] + [problem.line for problem in videos.problems]
     assert len(seen) == len(set(seen))
