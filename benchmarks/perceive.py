@@ -25,11 +25,11 @@ from ahoy_core.captures.body_errors import body_errors
 from ahoy_core.captures.fit import Clip, read_clip, true_fit, true_frames
 from ahoy_core.captures.texture_errors import texture_errors
 from ahoy_core.cost import Meter
-from ahoy_core.perceive.networks import FULL, Landmarker, Networks, files_of
+from ahoy_core.perceive.networks import Networks
 from ahoy_core.perceive.perceive import PerceiveConfig, Perception, perceive
 from ahoy_core.texture.inputs import TextureConfig
 from ahoy_core.texture.texture import build_texture
-from tasks.model_files import model_path
+from tasks.roles import landmark_networks
 
 
 def measure(
@@ -79,11 +79,6 @@ def _texel_error(capture: Capture, clip: Clip, body: PackagedBody, found: Percep
     return float(errors["texel_l1"])
 
 
-def load_networks(threads: int = 1, landmarker: Landmarker = FULL) -> Networks:
-    """The networks that are in the cache."""
-    return Networks({name: model_path(name) for name in files_of(landmarker)}, threads, landmarker)
-
-
 def mean_line(lines: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Means over captures of every number, under the capture's name "mean"."""
     keys = [k for k, v in lines[0].items() if isinstance(v, (int, float)) or v is None]
@@ -103,7 +98,7 @@ def main() -> None:
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     torch.set_num_threads(arguments.threads)
     config = PerceiveConfig.model_validate_strings(dict(pair.split("=", 1) for pair in arguments.set))
-    body, networks = load_packaged_body(), load_networks(arguments.threads, config.model)
+    body, networks = load_packaged_body(), landmark_networks(config.model, arguments.threads)
     lines = []
     for capture in read_dataset(arguments.captures, "ours"):
         lines.append(measure(capture, body, networks, config, not arguments.intrinsics_only, not arguments.no_texels))

@@ -36,7 +36,7 @@ from ahoy_core.perceive.corrector import (
 from ahoy_core.perceive.detection import detect
 from ahoy_core.perceive.landmarks import MIN_SCORE, read_crop
 from ahoy_core.perceive.networks import Networks
-from benchmarks.perceive import load_networks
+from tasks.roles import landmark_networks
 
 HELD_OUT = 0.1
 STEPS, BATCH, RATE, DECAY, DROPOUT = 1500, 128, 1e-3, 0.1, 0.2
@@ -288,7 +288,7 @@ def main() -> None:
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     torch.set_num_threads(1)
     if arguments.what == "read":
-        read(arguments.out, arguments.inputs[0], load_networks())
+        read(arguments.out, arguments.inputs[0], landmark_networks())
     else:
         train(arguments.out, arguments.inputs, arguments.json, arguments.steps)
 

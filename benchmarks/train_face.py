@@ -25,10 +25,10 @@ from ahoy_core.body.keypoints import keypoints
 from ahoy_core.body.packaged import PackagedBody, load_packaged_body
 from ahoy_core.perceive.face import STABLE, measures, on_reference, read_face
 from ahoy_core.perceive.networks import Networks
-from benchmarks.perceive import load_networks
 from benchmarks.rendered.people import Person, Wardrobe
 from benchmarks.rendered.render import View, render
 from benchmarks.rendered.rooms import box, sample_room
+from tasks.roles import landmark_networks
 
 SIZE = 160  # pixels of the rendered square
 PER_PERSON = 12  # pictures of one head
@@ -205,7 +205,7 @@ def main() -> None:
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     torch.set_num_threads(1)
     if arguments.what == "read":
-        read(arguments.out, arguments.assets, arguments.count, arguments.seed, load_networks())
+        read(arguments.out, arguments.assets, arguments.count, arguments.seed, landmark_networks())
     elif arguments.what == "golden":
         write_golden(arguments.out, arguments.assets, arguments.count, arguments.seed)
     else:

@@ -31,7 +31,7 @@ def list_() -> None:
     for status in model_files.verify():
         model = status.model
         size = f"{model.size / 2**20:.1f} MB"
-        state = "optional" if model.optional and status.state == "missing" else status.state
+        state = "optional" if status.left_out else status.state
         table.add_row(model.name, model.role, model.archive.label, size, model.licence, model.sha256[:12], state)
     console.print(table)
     console.print(f"kept in {model_files.cache_dir()} (AHOY_MODELS chooses another folder)", soft_wrap=True)
@@ -60,10 +60,7 @@ def pull(
 @app.command()
 def verify() -> None:
     """Hash every model file; the exit status says whether all are as they should be."""
-    known = model_files.verify()
-    bad = [
-        each for each in known if each.state == "wrong hash" or (each.state == "missing" and not each.model.optional)
-    ]
+    bad = [each for each in model_files.verify() if each.state != "ok" and not each.left_out]
     for status in bad:
         console.print(f"{status.model.name}: {status.state} ({status.path}); run `ahoy models pull`", soft_wrap=True)
     if bad:

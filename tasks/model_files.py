@@ -57,6 +57,11 @@ class ModelStatus:
     path: Path
     state: State
 
+    @property
+    def left_out(self) -> bool:
+        """Optional, and not here: nobody asked for it."""
+        return self.model.optional and self.state == "missing"
+
 
 def list_models(manifest: Path | None = None) -> tuple[ModelFile, ...]:
     """Read the manifest.
@@ -134,7 +139,7 @@ def pull(
     """
     report = progress or _silent
     asked = {_known(name, manifest).name for name in names}
-    wanted = [each for each in verify(manifest) if not each.model.optional or each.model.name in asked]
+    wanted = [each for each in verify(manifest) if not each.left_out or each.model.name in asked]
     lacking = [status for status in wanted if status.state != "ok"]
     for archive in dict.fromkeys(status.model.archive for status in lacking):
         members = [status for status in lacking if status.model.archive == archive]

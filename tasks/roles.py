@@ -9,6 +9,7 @@ from importlib import resources
 from pathlib import Path
 
 from ahoy_core.body.load import PACKAGED, body_files
+from ahoy_core.perceive.networks import FULL, Landmarker, Networks, files_of
 from ahoy_core.roles import FILLINGS, Perceptual
 from tasks.fills import Fills
 from tasks.model_files import ModelMissingError, list_models, model_path
@@ -55,6 +56,15 @@ def networks(names: Iterable[str]) -> Role:
     sources = ", ".join(sorted({m.archive.label for m in models}))
     name = f"{' + '.join(model.name for model in models)} ({sources})"
     return Role(name, ", ".join(sorted({m.licence for m in models})), digest)
+
+
+def landmark_networks(landmarker: Landmarker = FULL, threads: int = 1) -> Networks:
+    """Detector, landmark and face network from the cache.
+
+    Raises:
+        ModelFileError: one was never pulled, or is damaged.
+    """
+    return Networks({name: model_path(name) for name in files_of(landmarker)}, threads, landmarker)
 
 
 def ours(name: str) -> Role:

@@ -11,11 +11,10 @@ from pydantic import BaseModel, ConfigDict
 
 from ahoy_core.formats.images import write_png
 from ahoy_core.formats.npz import load_npz
-from ahoy_core.perceive.networks import FULL, Networks, files_of
+from ahoy_core.perceive.networks import FULL, files_of
 from ahoy_core.perceive.people import find_people, subject_sheet, subjects, worthwhile
 from ahoy_core.perceive.tracking import NoPersonError
-from tasks.model_files import model_path
-from tasks.roles import networks
+from tasks.roles import landmark_networks, networks
 from tasks.stage import Role, Stage, StageContext, StageOutput
 
 
@@ -28,7 +27,7 @@ class SubjectsConfig(BaseModel):
 def run_subjects(config: SubjectsConfig, ctx: StageContext) -> StageOutput:
     """Detect and link people, and draw them."""
     video = load_npz(ctx.inputs["ingest"] / "frames.npz")
-    nets = Networks({name: model_path(name) for name in files_of(FULL)}, num_threads=torch.get_num_threads())
+    nets = landmark_networks(threads=torch.get_num_threads())
     total, done = len(video["frames"]), 0
 
     def tick(note: str) -> None:

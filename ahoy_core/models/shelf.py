@@ -9,11 +9,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import torch
 
-_CPU: Final = torch.device("cpu")
 _kept: dict[tuple[object, ...], Any] = {}
 _filling = False
 
@@ -47,7 +46,9 @@ def network(path: Path, kind: str, device: torch.device, read: Callable[[], Any]
     """
     key = (str(path), kind, _stamps(path))
     if _filling:
-        return _kept.setdefault(key, read())
+        if key not in _kept:
+            _kept[key] = read()
+        return _kept[key]
     found = _kept.pop(key, None)
     return (read() if found is None else found).to(device)
 

@@ -203,7 +203,7 @@ def load_models() -> None:
         fills = fills_from_environment()
         fills.preload()
         preload_prior(fills)
-    except ModelError as error:
+    except (ModelError, ValueError, OSError, ImportError) as error:  # of a model, of the prior's files or libraries
         print(f"not loaded beforehand: {error}", file=sys.stderr)
     finally:
         torch.set_num_threads(threads)

@@ -59,9 +59,7 @@ class SmallRun:
 @pytest.fixture(scope="session")
 def models() -> None:
     """Skips where the landmark networks have not been pulled."""
-    missing = [
-        status.model.name for status in model_files.verify() if status.state != "ok" and not status.model.optional
-    ]
+    missing = [status.model.name for status in model_files.verify() if status.state != "ok" and not status.left_out]
     if missing:
         pytest.skip(f"needs the networks {', '.join(missing)}: run `ahoy models pull`")
 

@@ -207,6 +207,8 @@ def test_an_optional_network_is_pulled_by_name_alone(npm: Path) -> None:
         model_files.model_path("big", npm)
     (path,) = model_files.pull(names=["big"], manifest=npm)
     assert path.read_bytes() == b"a network of another size" and cached(npm.parent) == [path]
+    path.write_bytes(b"damaged")
+    assert model_files.pull(manifest=npm) == (path,) and path.read_bytes() == b"a network of another size"
     with pytest.raises(ModelFileError, match="expected one of the models big"):
         model_files.pull(names=["small"], manifest=npm)
 

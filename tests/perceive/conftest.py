@@ -3,8 +3,9 @@ from __future__ import annotations
 import pytest
 
 from ahoy_core.body.packaged import PackagedBody, load_packaged_body
-from ahoy_core.perceive.networks import FULL, Networks, files_of
-from tasks.model_files import ModelFileError, model_path
+from ahoy_core.perceive.networks import Networks
+from tasks.model_files import ModelFileError
+from tasks.roles import landmark_networks
 
 
 @pytest.fixture(scope="session")
@@ -16,6 +17,6 @@ def body() -> PackagedBody:
 def networks() -> Networks:
     """The real networks; the test is skipped where they were never pulled."""
     try:
-        return Networks({name: model_path(name) for name in files_of(FULL)})
+        return landmark_networks()
     except ModelFileError as error:
         pytest.skip(str(error))

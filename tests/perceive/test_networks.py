@@ -10,14 +10,15 @@ import numpy as np
 import pytest
 
 from ahoy_core.perceive.networks import FULL, Landmarker, Networks, RawLandmarks, _mean, files_of
-from tasks.model_files import ModelFileError, model_path
+from tasks.model_files import ModelFileError
+from tasks.roles import landmark_networks
 
 CROP = 256
 
 
 def _load(landmarker: Landmarker) -> Networks:
     try:
-        return Networks({name: model_path(name) for name in files_of(landmarker)}, landmarker=landmarker)
+        return landmark_networks(landmarker)
     except ModelFileError as error:
         pytest.skip(str(error))
 
