@@ -9,8 +9,8 @@
    steps at their border are not.
 
 All of it is done on colours from which the light they were seen in is divided out (`ahoy_core.texture.light`), and each
-texel is lit again where it lies. Seen texels keep their colours bit by bit. Skin is the one exception to "each part from itself": face and hands share
-it.
+texel is lit again where it lies. Seen texels keep their colours bit by bit. Skin is the one exception to "each part
+from itself": face and hands share it.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ WAIST_BAND = 0.1
 HEM_BAND = 0.22
 # A cut has to leave this many seen vertices on either side.
 LEAST_SIDE = 12
-# Lightness counts this much beside hue and saturation (CIE Lab): folds and shadows change the former, garments all three.
+# Lightness counts this much beside hue and saturation (CIE Lab): folds and shadows change it, garments all three.
 LIGHTNESS_WEIGHT = 0.3
 # Two garments are this far apart in such colours; one garment's upper and lower half in uneven light are at most 5.
 LEAST_CONTRAST = 8.0
