@@ -19,9 +19,9 @@ from ahoy_core.avatar.head import FaceViews
 from ahoy_core.avatar.supervision import CoarseInputs
 from ahoy_core.conventions import GREY, Cameras
 from ahoy_core.maps.template import Template
-from ahoy_core.texture.rays import BoolArray, Caster, FloatArray, HitMap, hit_map, to_camera
+from ahoy_core.texture.rays import BoolArray, Caster, FloatArray, IntArray, face_normals, hit_map, to_camera
 from ahoy_core.texture.surface import PARTS, Surface, interpolate_uv
-from ahoy_core.texture.texels import TexelMap, pad_charts, sample_atlas, texel_map, texel_normals
+from ahoy_core.texture.texels import TexelMap, face_coverage, pad_charts, sample_atlas, texel_map
 from ahoy_core.texture.texture import canonical_vertices
 from ahoy_core.texture.tones import FACE_SPAN, face_points
 
@@ -57,20 +57,32 @@ class HeadTexture:
     filled: float = 0.0
 
 
-class _Kinds(NamedTuple):
-    """Of N texels, bool: on the head, in the face, shown by the video, filled by a prior that may fill there."""
+class _Head(NamedTuple):
+    """The person's bare mesh: triangles, vertices [V,3] in canonical pose, and the triangles' normals [F,3]."""
 
-    head: BoolArray
-    face: BoolArray
-    seen: BoolArray
-    filled: BoolArray
+    surface: Surface
+    vertices: FloatArray
+    normals: FloatArray
+
+    def may_be_filled(self, points: FloatArray, triangles: IntArray) -> BoolArray:
+        """[N] where a prior may say what points [N,3] on triangles [N] look like: hair and the back of the head.
+
+        Above the hairline, or on the half behind and looking back: neither the face nor what is beside it (cheeks,
+        temples, nostrils), which is a face to whoever looks at it.
+        """
+        own, normals = self.vertices[self.surface.head], self.normals[triangles]
+        head = np.all(self.surface.head[self.surface.faces[triangles]], axis=1)
+        (_, front, low), (_, rear, high) = own.min(axis=0), own.max(axis=0)
+        above = points[:, 2] > low + FACE_SPAN[1] * (high - low)
+        behind = (normals[:, 1] > 0) & (points[:, 1] > (front + rear) / 2)
+        hair: BoolArray = head & (above | behind) & ~face_points(points, normals, head, own[:, 2])
+        return hair
 
 
 class _Layers(NamedTuple):
-    """Padded atlases [A,A,...]: colour of known texels alone, and which texels are of the face, seen, filled."""
+    """Padded atlases: colour [A,A,3] of known texels alone; share [A,A] that the video showed, that a prior filled."""
 
     colour: FloatArray
-    face: FloatArray
     seen: FloatArray
     filled: FloatArray
 
@@ -90,18 +102,19 @@ def reprojected_faces(inputs: CoarseInputs, template: Template, prior_filled: bo
     if not surface.head.any() or not bool(template.head.any()):
         return HeadTexture(None, "the body has no head")
     vertices = canonical_vertices(inputs.body, inputs.betas.numpy())
+    head = _Head(surface, vertices, face_normals(vertices, surface.faces))
     texels = texel_map(surface, len(inputs.atlas_coverage))
-    kinds = _kinds(inputs, surface, texels, vertices, prior_filled)
-    areas = texels.areas(vertices, surface) * kinds.head
-    observed, filled = (float(areas[kind].sum() / max(areas.sum(), 1e-12)) for kind in (kinds.seen, kinds.filled))
-    if not (kinds.head & (kinds.seen | kinds.filled)).any():
+    seen: BoolArray = inputs.atlas_coverage.numpy().ravel()[texels.flat] > 0
+    filled = prior_filled & ~seen & head.may_be_filled(texels.points(vertices, surface.faces), texels.face)
+    shares = _shares(head, inputs, texels, prior_filled)
+    if sum(shares) == 0:
         return HeadTexture(None, "no part of the head was observed, or filled by a prior")
-    layers = _layers(inputs, texels, kinds)
+    layers = _layers(inputs, texels, seen, filled)
     cameras = face_cameras(template, side, AZIMUTHS)
-    made = [_view(surface, vertices, layers, cameras[n]) for n in range(len(cameras))]
+    made = [_view(head, layers, cameras[n]) for n in range(len(cameras))]
     kept = [n for n, (_, weight, _) in enumerate(made) if float(weight.sum()) >= MIN_AREA]
     if not kept:
-        return HeadTexture(None, "too little of the head was observed, or filled by a prior", observed, filled)
+        return HeadTexture(None, "too little of the head was observed, or filled by a prior", *shares)
     weights = torch.stack([torch.from_numpy(made[n][1]) for n in kept])
     heads = torch.tensor([made[n][2] for n in kept])
     views = FaceViews(
@@ -114,60 +127,51 @@ def reprojected_faces(inputs: CoarseInputs, template: Template, prior_filled: bo
         # The loss is a mean over the pixels that count: few of them shall not weigh as much as a whole head.
         shares=SHARE * weights.sum((1, 2)) / heads,
     )
-    return HeadTexture(views, "", observed, filled)
+    return HeadTexture(views, "", *shares)
 
 
-def _kinds(
-    inputs: CoarseInputs, surface: Surface, texels: TexelMap, vertices: FloatArray, prior_filled: bool
-) -> _Kinds:
-    points, normals = texels.points(vertices, surface.faces), texel_normals(texels, vertices, surface)
-    head = np.all(surface.head[surface.faces[texels.face]], axis=1)
-    heights = vertices[surface.head][:, 2]
-    face = face_points(points, normals, head, heights)
-    above = points[:, 2] > heights.min() + FACE_SPAN[1] * (heights.max() - heights.min())
-    seen: BoolArray = inputs.atlas_coverage.numpy().ravel()[texels.flat] > 0
-    # Neither the face nor what looks ahead beside it (cheeks, temples): those are a face to whoever looks at them.
-    hair = head & ~face & (above | (normals[:, 1] > 0))
-    return _Kinds(head, face, seen, hair & ~seen & prior_filled)
+def _shares(head: _Head, inputs: CoarseInputs, texels: TexelMap, prior_filled: bool) -> tuple[float, float]:
+    """Shares of the bare head's area that the video showed, and that a prior filled; by triangles, not by texels."""
+    surface = head.surface
+    own = np.flatnonzero((surface.part == PARTS.index("head")) & surface.textured)
+    a, b, c = (head.vertices[surface.faces[own, corner]] for corner in range(3))
+    areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    seen = face_coverage(inputs.atlas_coverage.numpy(), texels, surface)[own]
+    filled = prior_filled * (1 - seen) * head.may_be_filled((a + b + c) / 3, own)
+    return float((areas * seen).sum() / areas.sum()), float((areas * filled).sum() / areas.sum())
 
 
-def _layers(inputs: CoarseInputs, texels: TexelMap, kinds: _Kinds) -> _Layers:
-    size = texels.size
-
+def _layers(inputs: CoarseInputs, texels: TexelMap, seen: BoolArray, filled: BoolArray) -> _Layers:
     def spread(values: BoolArray) -> BoolArray:
-        whole = np.zeros(size * size, dtype=bool)
+        whole = np.zeros(texels.size * texels.size, dtype=bool)
         whole[texels.flat[values]] = True
-        return whole.reshape(size, size)
+        return whole.reshape(texels.size, texels.size)
 
-    colour = inputs.atlas.permute(1, 2, 0).numpy()
-    face, seen, filled = (
-        pad_charts(spread(kind).astype(np.float32), texels.chart) for kind in (kinds.face, kinds.seen, kinds.filled)
-    )
-    return _Layers(pad_charts(colour, spread(kinds.seen | kinds.filled)), face, seen, filled)
+    colour = pad_charts(inputs.atlas.permute(1, 2, 0).numpy(), spread(seen | filled))
+    return _Layers(colour, *(pad_charts(spread(kind).astype(np.float32), texels.chart) for kind in (seen, filled)))
 
 
-def _view(
-    surface: Surface, vertices: FloatArray, layers: _Layers, camera: Cameras
-) -> tuple[FloatArray, FloatArray, int]:
+def _view(head: _Head, layers: _Layers, camera: Cameras) -> tuple[FloatArray, FloatArray, int]:
     """Picture [S,S,3] over grey, weights [S,S], and pixels of head in it."""
-    K = camera.Ks[0].numpy()
-    caster = Caster(to_camera(vertices, camera.viewmats[0].numpy()), surface.faces)
+    surface, K = head.surface, camera.Ks[0].numpy()
+    caster = Caster(to_camera(head.vertices, camera.viewmats[0].numpy()), surface.faces)
     hits = hit_map(caster, K, camera.width, camera.height)
-    head = (hits.face >= 0) & (surface.part[hits.face] == PARTS.index("head"))
-    inside = distance_transform_edt(head) > MARGIN * float(K[0, 0]) / DISTANCE
-    shown = head & inside & (hits.cosine >= GRAZING) & surface.textured[hits.face]
-    colour, weight = _looked_up(surface, layers, hits, shown)
-    image = np.full((*head.shape, 3), GREY, dtype=np.float32)
-    weights = np.zeros(head.shape, dtype=np.float32)
+    own = (hits.face >= 0) & (surface.part[hits.face] == PARTS.index("head"))
+    inside = distance_transform_edt(own) > MARGIN * float(K[0, 0]) / DISTANCE
+    shown = own & inside & (hits.cosine >= GRAZING) & surface.textured[hits.face]
+    colour, weight = _looked_up(head, layers, hits.face[shown], hits.bary[shown])
+    image = np.full((*own.shape, 3), GREY, dtype=np.float32)
+    weights = np.zeros(own.shape, dtype=np.float32)
     weights[shown] = weight
     image[shown] = np.where(weight[:, None] > 0, colour, GREY)
-    return image, weights, int(head.sum())
+    return image, weights, int(own.sum())
 
 
-def _looked_up(surface: Surface, layers: _Layers, hits: HitMap, shown: BoolArray) -> tuple[FloatArray, FloatArray]:
-    """Colours [N,3] and weights [N] of the pixels that are shown; a weight only where every texel touched is known."""
-    uv = interpolate_uv(surface, hits.face[shown], hits.bary[shown])
-    colour, face, seen, filled = (sample_atlas(layer, uv) for layer in layers)
-    weight = np.where(seen + filled >= _WHOLE, seen + FILLED * filled, 0)
-    # Of a face, not even the edge of a fill beside it.
-    return colour, np.where((face > 0) & (seen < _WHOLE), 0, weight).astype(np.float32)
+def _looked_up(head: _Head, layers: _Layers, face: IntArray, bary: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Colours [N,3] and weights [N] of points on triangles; a weight only where every texel touched is known."""
+    colour, seen, filled = (sample_atlas(layer, interpolate_uv(head.surface, face, bary)) for layer in layers)
+    points = (head.vertices[head.surface.faces[face]] * bary[:, :, None]).sum(axis=1)
+    # Texels are coarser than triangles: the edge of a fill must not reach into the face beside it.
+    known = head.may_be_filled(points, face) & (seen + filled >= _WHOLE)
+    weight = np.where(seen >= _WHOLE, 1, np.where(known, seen + FILLED * filled, 0))
+    return colour, weight.astype(np.float32)
