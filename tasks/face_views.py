@@ -20,7 +20,7 @@ from ahoy_core.maps.template import Template
 from tasks.stage import StageContext
 
 COLUMNS = 8
-_LEFT_OUT = 0.15  # brightness of what has no weight: no hair is confused with it at a glance
+_LEFT_OUT = (0.15, 0.25, 0.55)  # what has no weight: blue, which neither hair nor skin is
 
 
 @dataclass(frozen=True)
@@ -85,8 +85,8 @@ def prior_filled(ctx: StageContext) -> bool:
 
 
 def draw_faces(views: FaceViews, path: Path) -> None:
-    """The face views, dark where they have no weight."""
+    """The face views, blue where they have no weight and tinted where they have less."""
     weights = views.weights[:, None]
-    pictures = views.images * weights + _LEFT_OUT * (1 - weights)
+    pictures = views.images * weights + torch.tensor(_LEFT_OUT)[:, None, None] * (1 - weights)
     sheet = contact_sheet([to_uint8(p) for p in pictures], [str(n) for n in range(len(views))], columns=COLUMNS)
     write_png(path, sheet)

@@ -23,7 +23,7 @@ from ahoy_core.texture.rays import BoolArray, Caster, FloatArray, IntArray, face
 from ahoy_core.texture.surface import PARTS, Surface, interpolate_uv
 from ahoy_core.texture.texels import TexelMap, face_coverage, pad_charts, sample_atlas, texel_map
 from ahoy_core.texture.texture import canonical_vertices
-from ahoy_core.texture.tones import FACE_SPAN, face_points
+from ahoy_core.texture.tones import FACE_SPAN
 
 AZIMUTHS: Final = tuple(float(a) for a in range(-180, 180, 30))
 """Degrees. All round, unlike those of a generator of faces: here the back of the head is known, or at least filled."""
@@ -67,15 +67,15 @@ class _Head(NamedTuple):
     def may_be_filled(self, points: FloatArray, triangles: IntArray) -> BoolArray:
         """[N] where a prior may say what points [N,3] on triangles [N] look like: hair and the back of the head.
 
-        Above the hairline, or on the half behind and looking back: neither the face nor what is beside it (cheeks,
-        temples, nostrils), which is a face to whoever looks at it.
+        Above the hairline, or on the half behind and looking back: neither the face (`tones.face_points`) nor what is
+        beside it (cheeks, temples, nostrils), which is a face to whoever looks at it.
         """
         own, normals = self.vertices[self.surface.head], self.normals[triangles]
         head = np.all(self.surface.head[self.surface.faces[triangles]], axis=1)
         (_, front, low), (_, rear, high) = own.min(axis=0), own.max(axis=0)
         above = points[:, 2] > low + FACE_SPAN[1] * (high - low)
         behind = (normals[:, 1] > 0) & (points[:, 1] > (front + rear) / 2)
-        hair: BoolArray = head & (above | behind) & ~face_points(points, normals, head, own[:, 2])
+        hair: BoolArray = head & (above | behind)
         return hair
 
 
