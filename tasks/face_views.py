@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 
 from ahoy_core.avatar.face_role import generated_faces
-from ahoy_core.avatar.face_texture import HeadTexture, reprojected_faces
+from ahoy_core.avatar.face_texture import HeadTexture, head_observed, reprojected_faces
 from ahoy_core.avatar.face_views import observed_faces
 from ahoy_core.avatar.full_config import FullConfig
 from ahoy_core.avatar.head import FaceViews, join_faces
@@ -53,7 +53,7 @@ def choose_faces(
         made = generated_faces(face, seen, template, kinematics)
         return ChosenFaces(made, "", f'face views: {len(made)} by the role "face", from {len(seen)} frames')
     if config.face_views == "observed":
-        return ChosenFaces(seen, reason, "" if seen is None else f"face views: {_frames(seen)}")
+        return _frames_alone(seen, reason, head_observed(inputs))
     texture = reprojected_faces(inputs, template, prior_filled(ctx))
     if config.face_views == "reprojected":
         seen, reason = None, "not asked for"
@@ -62,7 +62,7 @@ def choose_faces(
 
 def _together(seen: FaceViews | None, reason: str, texture: HeadTexture) -> ChosenFaces:
     if texture.views is None:
-        return ChosenFaces(seen, f"{reason}; {texture.reason}", "" if seen is None else f"face views: {_frames(seen)}")
+        return _frames_alone(seen, f"{reason}; {texture.reason}", texture.observed)
     parts = ([] if seen is None else [_frames(seen)]) + [f"the head's own texture from {len(texture.views)} sides"]
     shares = (
         f"of the head {texture.observed:.0%} was observed, {texture.filled:.0%} filled by the prior (hair and back of "
@@ -70,6 +70,13 @@ def _together(seen: FaceViews | None, reason: str, texture: HeadTexture) -> Chos
     )
     views = texture.views if seen is None else join_faces(seen, texture.views)
     return ChosenFaces(views, "", f"face views: {' and '.join(parts)}; {shares}")
+
+
+def _frames_alone(seen: FaceViews | None, reason: str, observed: float) -> ChosenFaces:
+    if seen is None:
+        return ChosenFaces(None, reason)
+    shares = f"of the head {observed:.0%} was observed, and no face view says anything of the other {1 - observed:.0%}"
+    return ChosenFaces(seen, "", f"face views: {_frames(seen)}; {shares}")
 
 
 def _frames(seen: FaceViews) -> str:

@@ -64,6 +64,12 @@ class _Head(NamedTuple):
     vertices: FloatArray
     normals: FloatArray
 
+    @classmethod
+    def of(cls, inputs: CoarseInputs) -> _Head:
+        """The head of the person that inputs are of."""
+        surface, vertices = Surface.of(inputs.body), canonical_vertices(inputs.body, inputs.betas.numpy())
+        return cls(surface, vertices, face_normals(vertices, surface.faces))
+
     def may_be_filled(self, points: FloatArray, triangles: IntArray) -> BoolArray:
         """[N] where a prior may say what points [N,3] on triangles [N] look like: hair and the back of the head.
 
@@ -98,14 +104,12 @@ def reprojected_faces(inputs: CoarseInputs, template: Template, prior_filled: bo
             did not show has no weight at all.
         side: pixels of the square pictures.
     """
-    surface = Surface.of(inputs.body)
-    if not surface.head.any() or not bool(template.head.any()):
+    head = _Head.of(inputs)
+    if not head.surface.head.any() or not bool(template.head.any()):
         return HeadTexture(None, "the body has no head")
-    vertices = canonical_vertices(inputs.body, inputs.betas.numpy())
-    head = _Head(surface, vertices, face_normals(vertices, surface.faces))
-    texels = texel_map(surface, len(inputs.atlas_coverage))
+    texels = texel_map(head.surface, len(inputs.atlas_coverage))
     seen: BoolArray = inputs.atlas_coverage.numpy().ravel()[texels.flat] > 0
-    filled = prior_filled & ~seen & head.may_be_filled(texels.points(vertices, surface.faces), texels.face)
+    filled = prior_filled & ~seen & head.may_be_filled(texels.points(head.vertices, head.surface.faces), texels.face)
     shares = _shares(head, inputs, texels, prior_filled)
     if sum(shares) == 0:
         return HeadTexture(None, "no part of the head was observed, or filled by a prior")
@@ -130,6 +134,12 @@ def reprojected_faces(inputs: CoarseInputs, template: Template, prior_filled: bo
     return HeadTexture(views, "", *shares)
 
 
+def head_observed(inputs: CoarseInputs) -> float:
+    """Share of the bare head's area that the video showed, [0,1]; 0 for a body without a head."""
+    head = _Head.of(inputs)
+    return _shares(head, inputs, texel_map(head.surface, len(inputs.atlas_coverage)), prior_filled=False)[0]
+
+
 def _shares(head: _Head, inputs: CoarseInputs, texels: TexelMap, prior_filled: bool) -> tuple[float, float]:
     """Shares of the bare head's area that the video showed, and that a prior filled; by triangles, not by texels."""
     surface = head.surface
@@ -138,7 +148,8 @@ def _shares(head: _Head, inputs: CoarseInputs, texels: TexelMap, prior_filled: b
     areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     seen = face_coverage(inputs.atlas_coverage.numpy(), texels, surface)[own]
     filled = prior_filled * (1 - seen) * head.may_be_filled((a + b + c) / 3, own)
-    return float((areas * seen).sum() / areas.sum()), float((areas * filled).sum() / areas.sum())
+    whole = max(float(areas.sum()), 1e-12)
+    return float((areas * seen).sum()) / whole, float((areas * filled).sum()) / whole
 
 
 def _layers(inputs: CoarseInputs, texels: TexelMap, seen: BoolArray, filled: BoolArray) -> _Layers:

@@ -93,7 +93,7 @@ class FullConfig(BaseModel):
     shots_per_sequence: int = Field(default=3, ge=1, description="frames of each")
     frames_per_step: int = Field(default=2, ge=1, description="observed frames, of one map pose")
     face_views: FaceSource = Field(
-        default="both",
+        default="observed",
         description="observed: frames that show the face; reprojected: the head's own texture from all sides",
     )
     faces_per_step: int = Field(default=2, ge=1, description="face views")

@@ -291,7 +291,11 @@ def test_the_summary_says_which_face_views_and_what_they_rest_on(tmp_path):
     alone = _chosen(inputs, tmp_path, True, face_views="reprojected")
     assert alone.note.startswith("face views: the head's own texture") and alone.views is not None
     observed = _chosen(inputs, tmp_path, True, face_views="observed")
-    assert observed.note == "face views: 3 frames of the video" and len(observed.views or ()) == 3
+    assert (
+        observed.note.startswith("face views: 3 frames of the video; of the head ") and len(observed.views or ()) == 3
+    )
+    for words in (f"{made.observed:.0%} was observed", f"anything of the other {1 - made.observed:.0%}"):
+        assert words in observed.note
     blind = replace(inputs, masks=torch.zeros_like(inputs.masks), atlas_coverage=torch.zeros(SIZE, SIZE))
     none = _chosen(blind, tmp_path, False, face_views="both")
     assert none.views is None and "never seen" in none.reason and "no part of the head" in none.reason
