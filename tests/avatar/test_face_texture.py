@@ -70,6 +70,12 @@ def _views(inputs: CoarseInputs, prior_filled: bool = True) -> FaceViews:
     return views
 
 
+@cache
+def _whole() -> FaceViews:
+    """Views of a head that was observed all over."""
+    return _views(_textured(np.ones(len(head()[3]))))
+
+
 def _hits(views: FaceViews, number: int) -> tuple[HitMap, np.ndarray]:
     """What a view's pixels see, and their points [H,W,3] in the world (NaN where nothing)."""
     camera = views.cameras
@@ -185,13 +191,13 @@ def test_where_no_prior_filled_what_was_not_seen_has_no_weight():
         _, where = _hits(made.views, number)
         assert not (made.views.weights[number].numpy() > 0)[where[..., 0] < -0.005].any()
     # Whoever is seen from the right alone shows the cameras on the left next to nothing: no views, or little share.
-    whole = _views(_textured(np.ones(len(points))))
+    whole = _whole()
     assert len(made.views) < len(whole)
     assert float(made.views.shares.min()) < 0.3 * float(whole.shares.min())
 
 
 def test_the_outline_of_the_bare_head_has_no_weight():
-    views = _views(_textured(np.ones(len(head()[3]))))
+    views = _whole()
     pixel = 1.0 / float(views.cameras.Ks[0, 0, 0])  # metres, at the cameras' distance of 1 m
     for number in range(len(views)):
         on_head, *_ = _pixel_kinds(views, number)
@@ -220,7 +226,7 @@ def test_nothing_observed_too_little_and_no_head_give_no_views_and_the_reason():
 
 
 def test_two_sets_together_keep_their_weight_and_their_cameras():
-    large, small = replace(faces(3), shares=torch.full((3,), 0.5)), _views(_textured(np.ones(len(head()[3]))))
+    large, small = replace(faces(3), shares=torch.full((3,), 0.5)), _whole()
     both = join_faces(large, small)
     assert len(both) == 3 + len(small) and both.images.shape[2:] == (SIDE, SIDE)
     for part, own in ((slice(0, 3), large), (slice(3, None), small)):
