@@ -26,15 +26,18 @@ from ahoy_core.captures.fit import posed_vertices, read_clip, true_fit, true_fra
 from ahoy_core.conventions import Cameras
 from ahoy_core.cost import machine
 from ahoy_core.prior.canonical import CanonicalFill, check_prior
+from ahoy_core.prior.clips import load_clips
 from ahoy_core.prior.conditioning import Context
 from ahoy_core.prior.config import IdentityConfig
 from ahoy_core.prior.corpus.prompts import NEUTRAL
 from ahoy_core.prior.corpus.shards import shards
 from ahoy_core.prior.corpus.wardrobe import SPLITS
-from ahoy_core.prior.evaluate import held_out, load_clips, psnr
-from ahoy_core.prior.identity import Frames, train_identity
+from ahoy_core.prior.evaluate import held_out
+from ahoy_core.prior.evidence import Frames
+from ahoy_core.prior.identity import train_identity
 from ahoy_core.prior.inversion import clean_up
 from ahoy_core.prior.round_trip import round_trips
+from ahoy_core.prior.scores import psnr
 from ahoy_core.prior.solvers import EVALUATIONS
 from ahoy_core.prior.subject import subject_frames
 from ahoy_core.prior.text import IDENTITY_PROMPT

@@ -18,6 +18,8 @@ class IdentityConfig(BaseModel):
         batch: frames a step.
         lr: of the low-rank updates.
         token_lr: of the learned word.
+        pure_noise: share of the flow times that are 1 exactly, where the colours of a garment are decided.
+        mirror: learn from each frame's mirror image too, for sides that the video never shows.
         seed: of the frames, noise and times drawn.
     """
 
@@ -28,6 +30,8 @@ class IdentityConfig(BaseModel):
     batch: int = Field(8, ge=1)
     lr: float = Field(2e-3, gt=0)
     token_lr: float = Field(1e-2, gt=0)
+    pure_noise: float = Field(0.3, ge=0, le=1)
+    mirror: bool = True
     seed: int = 0
 
 
