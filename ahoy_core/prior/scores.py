@@ -28,20 +28,29 @@ def gradient_energy(pictures: Tensor, weight: Tensor) -> float:
     return float((across + down) / (6 * weight.sum()).clamp(min=1))
 
 
-def colour_distance(made: Tensor, truth: Tensor, weight: Tensor) -> Tensor:
+def colour_distance(made: Tensor, truth: Tensor, weight: Tensor, light_apart: bool = False) -> Tensor:
     """Distance (0 to sqrt 3) of the mean colours of one garment of one subject, over all the frames that show it.
 
     Args:
         made: [...,T,3,H,W] in [0,1].
         truth: likewise.
         weight: [...,T,1,H,W], the garment's alpha.
+        light_apart: bring both to the truth's brightness first. How bright a garment is from a side is the light's
+            doing, and the frames of a video do not tell it of the sides that they do not show.
 
     Returns:
         [...], NaN where the frames show less than `_LEAST` pixels of it.
     """
     area = weight.sum((-4, -3, -2, -1))
-    difference = ((made - truth) * weight).sum((-4, -2, -1)) / area.clamp(min=1e-6)[..., None]
-    return torch.where(area >= _LEAST, difference.norm(dim=-1), torch.full_like(area, math.nan))
+    ours, theirs = (_mean_colour(pictures, weight) for pictures in (made, truth))
+    if light_apart:
+        ours = ours * (theirs.norm(dim=-1) / ours.norm(dim=-1).clamp(min=1e-6))[..., None]
+    return torch.where(area >= _LEAST, (ours - theirs).norm(dim=-1), torch.full_like(area, math.nan))
+
+
+def _mean_colour(pictures: Tensor, weight: Tensor) -> Tensor:
+    """[...,3] of pictures [...,T,3,H,W] under weights [...,T,1,H,W]."""
+    return (pictures * weight).sum((-4, -2, -1)) / weight.sum((-4, -3, -2, -1)).clamp(min=1e-6)[..., None]
 
 
 def perceptual_distance(network: Perceptual, made: Tensor, truth: Tensor, weight: Tensor) -> Tensor:
