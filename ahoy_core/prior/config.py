@@ -28,7 +28,7 @@ class IdentityConfig(BaseModel):
     rank: int = Field(4, ge=1)
     steps: int = Field(120, ge=1)
     batch: int = Field(8, ge=1)
-    lr: float = Field(2e-3, gt=0)
+    lr: float = Field(4e-3, gt=0)
     token_lr: float = Field(1e-2, gt=0)
     pure_noise: float = Field(0.3, ge=0, le=1)
     mirror: bool = True
