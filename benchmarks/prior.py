@@ -143,6 +143,7 @@ def main() -> None:
     parser.add_argument("--clips", type=int, default=24, help="held-out clips of each split")
     parser.add_argument("--splits", nargs="+", choices=_HELD_OUT, default=_HELD_OUT, help="held-out splits")
     parser.add_argument("--parts", nargs="+", choices=_PARTS, default=_PARTS, help="what to measure")
+    parser.add_argument("--solver-clips", type=int, default=1, help="of each held-out split, for the part solvers")
     parser.add_argument("--people", type=int, default=1, help="of each held-out split, for the part identity")
     parser.add_argument("--plots", type=Path, help="folder for the curves' PNGs")
     parser.add_argument("--threads", type=int, default=1)
@@ -161,7 +162,7 @@ def main() -> None:
     if arguments.corpus is not None and "held-out" in arguments.parts:
         found["held_out"] = held_out(video, arguments.corpus, arguments.clips, arguments.splits, perceptual)
     if arguments.corpus is not None and "solvers" in arguments.parts:
-        found["solvers"] = solvers(video, arguments.corpus, perceptual)
+        found["solvers"] = solvers(video, arguments.corpus, arguments.solver_clips, perceptual)
     captures = list(read_dataset(arguments.captures, "ours"))
     body = load_packaged_body()
     if "identity" in arguments.parts:

@@ -26,13 +26,12 @@ BUDGETS = (8, 16, 32, 64)
 _REFERENCE_STEPS = 128  # of RK4: 512 evaluations, eight times the largest budget
 RANKS = (2, 4, 8, 16)
 STEPS = (20, 40, 80, 160)
-_CLIPS = 2  # of a split: solvers are compared on the same ones
 _SPLITS: tuple[Split, ...] = ("people", "mesh")
 
 
-def solvers(video: VideoModel, corpus: Path, perceptual: Perceptual | None) -> dict[str, Any]:
+def solvers(video: VideoModel, corpus: Path, clips: int, perceptual: Perceptual | None) -> dict[str, Any]:
     """Round trip, distance of z1 to a converged reference, and what RF-inversion's pictures are worth."""
-    shown = {split: load_clips(shards(corpus, split)[0], _CLIPS, turning=False) for split in _SPLITS}
+    shown = {split: load_clips(shards(corpus, split)[0], clips, turning=False) for split in _SPLITS}
     few = load_clips(shards(corpus, "people")[0], 1).views([0, 2, 4, 6])
     names = tuple(EVALUATIONS)
     trips = round_trips(video, few, BUDGETS, names, _REFERENCE_STEPS)
