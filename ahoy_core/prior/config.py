@@ -10,7 +10,7 @@ from ahoy_core.prior.solvers import Solver
 
 
 class IdentityConfig(BaseModel):
-    """Knobs of the fine-tuning.
+    """Knobs of the fine-tuning. Rank and steps cite their row: docs/prior.md, "Rank and steps".
 
     Attributes:
         rank: of the low-rank updates.
@@ -26,7 +26,7 @@ class IdentityConfig(BaseModel):
     model_config = ConfigDict(frozen=True)
 
     rank: int = Field(4, ge=1)
-    steps: int = Field(120, ge=1)
+    steps: int = Field(80, ge=1)
     batch: int = Field(8, ge=1)
     lr: float = Field(4e-3, gt=0)
     token_lr: float = Field(1e-2, gt=0)
