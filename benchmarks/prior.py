@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -26,28 +25,25 @@ from ahoy_core.captures.fit import posed_vertices, read_clip, true_fit, true_fra
 from ahoy_core.conventions import Cameras
 from ahoy_core.cost import machine
 from ahoy_core.prior.canonical import CanonicalFill, check_prior
-from ahoy_core.prior.conditioning import Context
 from ahoy_core.prior.config import IdentityConfig
 from ahoy_core.prior.corpus.prompts import NEUTRAL
-from ahoy_core.prior.corpus.shards import shards
 from ahoy_core.prior.corpus.wardrobe import SPLITS
-from ahoy_core.prior.evaluate import held_out, load_clips, psnr
-from ahoy_core.prior.identity import Frames, train_identity
-from ahoy_core.prior.inversion import clean_up
-from ahoy_core.prior.round_trip import round_trips
-from ahoy_core.prior.solvers import EVALUATIONS
+from ahoy_core.prior.evaluate import held_out
+from ahoy_core.prior.evidence import Frames
+from ahoy_core.prior.identity_curve import Subject, generated, identity_curve
+from ahoy_core.prior.scores import psnr
 from ahoy_core.prior.subject import subject_frames
-from ahoy_core.prior.text import IDENTITY_PROMPT
 from ahoy_core.prior.video import VideoModel, load_video
 from ahoy_core.texture.atlas import ObservedAtlas
 from ahoy_core.texture.texture import TextureConfig, build_texture
+from benchmarks.prior_curves import draw_curves, identity, solvers
+from tasks.fills import Fills
+from tasks.roles import perceptual_network
 
-_BUDGETS = (16, 32)
-_REFERENCE_STEPS = 32  # of RK4: 128 evaluations
 _CAMERAS = ("front", "left", "back", "right")
 _BANDS = {"torso": (0.1, 0.6), "legs": (-0.85, -0.1)}  # of the body's height in [-1,1]
 _IDENTITY_FRAMES = 12
-_PARTS = ("held-out", "round-trip", "captures")
+_PARTS = ("held-out", "captures", "solvers", "identity")
 _HELD_OUT = tuple(split for split in SPLITS if split != "train")
 
 
@@ -82,18 +78,6 @@ def video_frames(capture: Capture, body: PackagedBody) -> Frames:
     return subject_frames(images, visible, cameras, body, vertices, root)
 
 
-def generated(video: VideoModel, views: Frames, prompt: str, front: bool) -> Tensor:
-    """Posterior mean of the four views [4,3,H,W], with the front held or with nothing but text and body."""
-    assert views.body is not None and views.azimuth is not None
-    with torch.no_grad():
-        known = video.encode(views.images.transpose(0, 1)[None])
-        held = torch.zeros(1, 4, known.shape[3] // 2, known.shape[4] // 2, dtype=torch.bool)
-        held[:, 0] = front
-        context = Context(video.embed([prompt]), known, held, views.body[None], views.azimuth[None])
-        noise = torch.randn(known.shape, generator=torch.Generator().manual_seed(0))
-        return video.decode(clean_up(video, noise, context, 1).latents)[0].transpose(0, 1)
-
-
 def band_weight(views: Frames, name: str) -> Tensor:
     """[4,1,H,W] alpha of a band of the body's height."""
     assert views.body is not None
@@ -109,9 +93,18 @@ def colours(pictures: Tensor, weight: Tensor) -> Tensor:
     return (pictures * weight).sum((0, 2, 3)) / weight.sum().clamp(min=1)
 
 
-def capture_figures(load: Callable[[], VideoModel], capture: Capture, body: PackagedBody) -> dict[str, Any]:
+def capture_subject(capture: Capture, body: PackagedBody) -> Subject:
+    """A capture's person: frames of the occluded video, and the four cameras, of which only the front one is shown."""
+    views = static_views(capture, body)
+    garments = {name: band_weight(views, name) for name in _BANDS}
+    held_back = torch.tensor([name != "front" for name in _CAMERAS])
+    return Subject(capture.name, video_frames(capture, body), views, garments, held_back)
+
+
+def capture_figures(video: VideoModel, capture: Capture, body: PackagedBody) -> dict[str, Any]:
     """Front to the other three cameras, and garment colours before and after the identity fine-tuning."""
-    video, views, frames = load(), static_views(capture, body), video_frames(capture, body)
+    subject = capture_subject(capture, body)
+    views = subject.views
     turned = generated(video, views, NEUTRAL, front=True)
     mirror = views.images[:1].flip(-1).expand_as(views.images)
     flat = torch.full_like(views.images, 0.5)
@@ -121,23 +114,14 @@ def capture_figures(load: Callable[[], VideoModel], capture: Capture, body: Pack
     found: dict[str, Any] = {
         "self_check": self_checked(video, capture, body),
         "static_from_front": {},
-        "identity": {},
     }
     for name in _BANDS:
         weight = band_weight(views, name)[1:]
         for label, made in (("prior", turned), ("mirror", mirror), ("colours", flat)):
             found["static_from_front"][f"{label}/{name}"] = float(psnr(made[1:], views.images[1:], weight).nanmean())
-    before = generated(video, views, NEUTRAL, front=False)
-    start = time.process_time()
-    curve = train_identity(video, frames, IdentityConfig()).losses
-    found["identity"]["cpu_seconds"] = round(time.process_time() - start, 1)
-    found["identity"]["loss_first_last"] = [float(curve[:20].mean()), float(curve[-20:].mean())]
-    after = generated(video, views, IDENTITY_PROMPT, front=False)
-    for name in _BANDS:
-        weight = band_weight(views, name)
-        truth = colours(views.images, weight)
-        for label, made in (("before", before), ("after", after)):
-            found["identity"][f"colour_distance_{label}/{name}"] = float((colours(made, weight) - truth).norm())
+    config = IdentityConfig()
+    rows = identity_curve(video, subject, (config.rank,), (config.steps,))
+    found["identity"] = dict(zip(("before", "after"), rows, strict=True))
     return found
 
 
@@ -159,12 +143,16 @@ def main() -> None:
     parser.add_argument("--clips", type=int, default=24, help="held-out clips of each split")
     parser.add_argument("--splits", nargs="+", choices=_HELD_OUT, default=_HELD_OUT, help="held-out splits")
     parser.add_argument("--parts", nargs="+", choices=_PARTS, default=_PARTS, help="what to measure")
+    parser.add_argument("--solver-clips", type=int, default=1, help="of each held-out split, for the part solvers")
+    parser.add_argument("--people", type=int, default=1, help="of each held-out split, for the part identity")
+    parser.add_argument("--plots", type=Path, help="folder for the curves' PNGs")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--json", type=Path, required=True)
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
     start = time.process_time()
     video = load_video(arguments.prior)
+    perceptual = perceptual_network(Fills())
     found: dict[str, Any] = json.loads(arguments.json.read_text(encoding="utf-8")) if arguments.json.exists() else {}
     found |= {
         "machine": machine(),
@@ -172,16 +160,18 @@ def main() -> None:
         "prior_load_cpu_seconds": round(time.process_time() - start, 2),
     }
     if arguments.corpus is not None and "held-out" in arguments.parts:
-        found["held_out"] = held_out(video, arguments.corpus, arguments.clips, arguments.splits)
-    if arguments.corpus is not None and "round-trip" in arguments.parts:
-        some = load_clips(shards(arguments.corpus, "people")[0], 1).views([0, 2, 4, 6])
-        found["round_trip"] = round_trips(video, some, _BUDGETS, tuple(EVALUATIONS), _REFERENCE_STEPS)
+        found["held_out"] = held_out(video, arguments.corpus, arguments.clips, arguments.splits, perceptual)
+    if arguments.corpus is not None and "solvers" in arguments.parts:
+        found["solvers"] = solvers(video, arguments.corpus, arguments.solver_clips, perceptual)
+    captures = list(read_dataset(arguments.captures, "ours"))
+    body = load_packaged_body()
+    if "identity" in arguments.parts:
+        people = [capture_subject(capture, body) for capture in captures]
+        found["identity"] = identity(video, arguments.corpus, people, arguments.people)
     if "captures" in arguments.parts:
-        body = load_packaged_body()
-        found["captures"] = {
-            capture.name: capture_figures(lambda: load_video(arguments.prior), capture, body)
-            for capture in read_dataset(arguments.captures, "ours")
-        }
+        found["captures"] = {capture.name: capture_figures(video, capture, body) for capture in captures}
+    if arguments.plots is not None:
+        draw_curves(found, arguments.plots)
     arguments.json.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
 
 

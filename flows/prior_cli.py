@@ -94,9 +94,11 @@ def evaluate(
     """Measure a prior on people, garments and motions that it was not trained on."""
     from ahoy_core.prior.evaluate import held_out
     from ahoy_core.prior.video import load_video
+    from tasks.fills import Fills
+    from tasks.roles import perceptual_network
 
     _use_threads(threads)
-    figures = held_out(load_video(prior), corpus_folder, clips)
+    figures = held_out(load_video(prior), corpus_folder, clips, perceptual=perceptual_network(Fills()))
     out.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
     console.print_json(data=figures)
 

@@ -160,6 +160,7 @@ ARTIFACTS: Mapping[str, tuple[Blob, ...]] = {
         Blob("losses.parquet", optional=True),  # none where the coarse avatar is kept (ablation A)
         Blob("losses.png", optional=True),
         Blob("training.png", optional=True),  # targets above renders, as the training went
+        Blob("faces.png", optional=True),  # the face views, blue where nothing counts; none without a head path
         Blob("compare.png"),
     ),
     "animate": (

@@ -13,18 +13,16 @@ import torch
 
 from ahoy_core.avatar.avatar import Avatar, AvatarInfo
 from ahoy_core.avatar.coarse_renders import coarse_sequences
-from ahoy_core.avatar.face_role import generated_faces
-from ahoy_core.avatar.face_views import observed_faces
 from ahoy_core.avatar.files import load_avatar, save_avatar
 from ahoy_core.avatar.full import FullResult, train_full
 from ahoy_core.avatar.full_config import FullConfig
 from ahoy_core.avatar.full_inputs import FullInputs
 from ahoy_core.avatar.hallucinated import Supervision
-from ahoy_core.avatar.kinematics import Kinematics
 from ahoy_core.avatar.supervision import CoarseInputs
 from ahoy_core.body.canonical import canonical_pose
 from ahoy_core.formats.images import contact_sheet, to_uint8, write_png
 from ahoy_core.formats.npz import load_npz
+from tasks.face_views import choose_faces, draw_faces
 from tasks.hallucinate import read_supervision
 from tasks.roles import ours, packaged_body, perceptual_network, perceptual_role
 from tasks.stage import Role, Stage, StageContext, StageOutput
@@ -56,9 +54,13 @@ def run_avatar(config: FullConfig, ctx: StageContext) -> StageOutput:
     save_avatar(result.avatar, ctx.out)
     checkpoint.unlink(missing_ok=True)
     draw_training(result, TERMS, observed, ctx.out)
+    pictures = ["compare.png", "training.png", "losses.png"]
+    if inputs.faces is not None:
+        draw_faces(inputs.faces, ctx.out / "faces.png")
+        pictures.append("faces.png")
     return StageOutput(
         _summary(result, notes),
-        ("compare.png", "training.png", "losses.png"),
+        tuple(pictures),
         metrics=held_out_rows(result.held_out, "full"),
     )
 
@@ -78,22 +80,24 @@ def _full_inputs(
     with torch.no_grad():
         base = template.gather(coarse.network(template.maps()))
     expression = torch.from_numpy(load_npz(ctx.inputs["perceive"] / "body.npz", ["expression"])["expression"])
-    kinematics = Kinematics.of(observed.body, observed.betas.float())
-    faces, reason = observed_faces(observed, template, kinematics, expression)
-    face = ctx.fills.get("face")
-    if face is not None and faces is not None:
-        faces = generated_faces(face, faces, template, kinematics)
+    faces = choose_faces(observed, template, expression, config, ctx)
+    sequences, note = _sequences(coarse, observed, config, ctx)
+    notes = [note, faces.note] if faces.note else [note]
+    return FullInputs(observed, template, base, sequences, faces.views, faces.reason), notes
+
+
+def _sequences(
+    coarse: Avatar, observed: CoarseInputs, config: FullConfig, ctx: StageContext
+) -> tuple[tuple[Supervision, ...], str]:
     if config.switches.supervise == "none":
-        return FullInputs(observed, template, base, (), faces, reason), ["no sequences: switched off (B1)"]
+        return (), "no sequences: switched off (B1)"
     if (made := _hallucinated(ctx)) and config.switches.supervise == "hallucinated":
-        note = f"supervised by {len(made)} hallucinated sequences: {', '.join(s.name for s in made)}"
-        return FullInputs(observed, template, base, made, faces, reason), [note]
-    sequences = coarse_sequences(coarse, observed.body, _map_poses(observed))
+        return made, f"supervised by {len(made)} hallucinated sequences: {', '.join(s.name for s in made)}"
     note = (
         "no prior has repainted the coarse renders (section 3.2): they supervise as they are, weighted by what the "
         "video never showed (ablation B2's data)"
     )
-    return FullInputs(observed, template, base, sequences, faces, reason), [note]
+    return coarse_sequences(coarse, observed.body, _map_poses(observed)), note
 
 
 def _hallucinated(ctx: StageContext) -> tuple[Supervision, ...]:
@@ -142,7 +146,7 @@ def _roles(config: FullConfig) -> Mapping[str, Role]:
 
 AVATAR = Stage(
     "avatar",
-    2,
+    3,
     FullConfig,
     ("ingest", "perceive", "texture", "coarse"),
     run_avatar,

@@ -60,6 +60,7 @@ CAPTIONS = {
     ("hallucinate", "before_after.png"): "above the coarse renders, below the same frames hallucinated",
     ("avatar", "compare.png"): "frames of the video beside the whole avatar in the same pose, hidden parts included",
     ("avatar", "training.png"): "as the training went: what supervises above, the avatar below",
+    ("avatar", "faces.png"): "the face views that supervise the head; blue has no weight, tinted less",
     ("avatar", "losses.png"): "terms of the objective by step, and the score of a frame held out of training",
     ("animate", "turntable.png"): "eight views of the avatar",
 }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -13,6 +13,7 @@ from ahoy_core.body.load import load_body
 from ahoy_core.formats.images import contact_sheet, write_png
 from ahoy_core.formats.npz import load_npz, save_npz
 from ahoy_core.texture.by_roles import charts_on, complete_by, dense_by
+from ahoy_core.texture.light import shading
 from ahoy_core.texture.surface import Surface
 from ahoy_core.texture.texture import Texture, TextureConfig, build_texture
 from tasks.roles import ours, packaged_body
@@ -57,6 +58,7 @@ def _summary(texture: Texture, total: int) -> dict[str, Any]:
         "copied from the other side": f"{notes['mirrored_share']:.0%}",
         "blended in": f"{notes['diffused_share']:.0%}",
         "fill": notes["fill"],
+        "light": light_words(notes["light"]),
         "frames that wrote": f"{len(notes['frames_used'])} of {total}",
     }
     if (moved := notes.get("moved_by_charts_px")) is not None:
@@ -69,6 +71,18 @@ def _summary(texture: Texture, total: int) -> dict[str, Any]:
         "notes": [*rejected, *([f"and {more} more frames, see texture.json"] if more else [])],
         "observed_share": notes["observed_share"],
     }
+
+
+def light_words(slope: Sequence[float]) -> str:
+    """What a person reads of the estimated light.
+
+    Args:
+        slope: [3] of brightness over the normal of the canonical body: its left, its back, up.
+    """
+    if not any(slope):
+        return "not estimated"
+    left, back, up = (shading(np.eye(3), np.asarray(slope)) / shading(-np.eye(3), np.asarray(slope))).tolist()
+    return f"back {back:.0%} as bright as front, left {left:.0%} as right, what faces up {up:.0%} as what faces down"
 
 
 def _pictures(texture: Texture, ctx: StageContext) -> None:
@@ -95,4 +109,4 @@ def _roles(config: TextureConfig) -> Mapping[str, Role]:
     }
 
 
-TEXTURE = Stage("texture", 2, TextureConfig, ("ingest", "perceive"), run_texture, _roles, fillable=FILLABLE)
+TEXTURE = Stage("texture", 3, TextureConfig, ("ingest", "perceive"), run_texture, _roles, fillable=FILLABLE)

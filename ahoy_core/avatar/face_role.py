@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Final
 
 import torch
@@ -22,17 +23,18 @@ FILLS: Final = 0.7  # share of the picture that the head's box fills
 _NOTHING: Final = 0.02  # difference from grey below which a picture shows nothing
 
 
-def face_cameras(template: Template, side: int) -> Cameras:
+def face_cameras(template: Template, side: int, azimuths: Sequence[float] = AZIMUTHS) -> Cameras:
     """Cameras on a sphere round the bare head in the canonical pose, all looking at its middle.
 
     Args:
         template: the bare body.
         side: pixels of the square pictures.
+        azimuths: degrees, at each of `ELEVATIONS`; by default those of a generator, which knows faces from the front.
     """
     head = template.means[template.head]
     centre, extent = (head.amax(0) + head.amin(0)) / 2, float((head.amax(0) - head.amin(0)).max())
-    azimuths = torch.deg2rad(torch.tensor(AZIMUTHS))
-    eyes = torch.cat([orbit_eyes(centre, DISTANCE, azimuths, math.radians(up)) for up in ELEVATIONS])
+    turns = torch.deg2rad(torch.tensor(azimuths))
+    eyes = torch.cat([orbit_eyes(centre, DISTANCE, turns, math.radians(up)) for up in ELEVATIONS])
     focal = FILLS * side * DISTANCE / extent
     K = torch.tensor([[focal, 0, side / 2], [0, focal, side / 2], [0, 0, 1.0]])
     return Cameras(look_at(eyes, centre), K.expand(len(eyes), 3, 3).clone(), side, side)
@@ -69,6 +71,7 @@ def generated_faces(
         cameras,
         still.expand(len(cameras), -1, -1, -1),
         middle.expand(len(cameras), -1),
+        torch.ones(len(cameras)),
     )
 
 

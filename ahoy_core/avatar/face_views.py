@@ -77,7 +77,7 @@ def observed_faces(
     actions = torch.zeros(len(found), inputs.body.n_expressions) if expression is None else expression[numbers].float()
     relative = torch.stack([c.relative for c in found])
     pictures = torch.stack(images), torch.stack(alphas), torch.stack(weights)
-    return FaceViews(*pictures, cameras, relative, actions, SHARE), ""
+    return FaceViews(*pictures, cameras, relative, actions, torch.full((len(found),), SHARE)), ""
 
 
 def _candidate(inputs: CoarseInputs, template: Template, kinematics: Kinematics, number: int) -> _Candidate | None:

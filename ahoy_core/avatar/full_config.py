@@ -12,6 +12,7 @@ from ahoy_core.avatar.deform import OffsetBounds
 from ahoy_core.avatar.losses import LossWeights
 
 Supervise = Literal["hallucinated", "coarse", "none"]
+FaceSource = Literal["observed", "reprojected", "both"]
 
 
 class FullWeights(LossWeights):
@@ -91,6 +92,10 @@ class FullConfig(BaseModel):
     sequences_per_step: int = Field(default=2, ge=1, description="hallucinated sequences, one network pass each")
     shots_per_sequence: int = Field(default=3, ge=1, description="frames of each")
     frames_per_step: int = Field(default=2, ge=1, description="observed frames, of one map pose")
+    face_views: FaceSource = Field(
+        default="observed",
+        description="observed: frames that show the face; reprojected: the head's own texture from all sides",
+    )
     faces_per_step: int = Field(default=2, ge=1, description="face views")
     max_frames: int = Field(default=48, ge=1, description="observed frames kept, evenly spread")
     observed_map_poses: int = Field(default=4, ge=1, description="map poses that the observed frames share")

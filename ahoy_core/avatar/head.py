@@ -8,13 +8,14 @@ import numpy as np
 import torch
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
+from torch.nn.functional import pad
 
 from ahoy_core.avatar.deform import deform, dense_weights
 from ahoy_core.avatar.kinematics import Kinematics
 from ahoy_core.avatar.render import render
 from ahoy_core.body.model import BodyModel
 from ahoy_core.body.shared import shared_canonical_pose
-from ahoy_core.conventions import Cameras
+from ahoy_core.conventions import GREY, Cameras
 from ahoy_core.maps.template import Template
 
 HEAD_REACH = 0.12
@@ -33,7 +34,8 @@ class FaceViews:
         cameras: P cameras.
         relative: [P,J,4,4] canonical -> the cameras' space; identities for cameras in the canonical head frame.
         expression: [P,E] face actions.
-        share: Of the head's weight that they get: less than 1 where they count a second time what another loss counts.
+        shares: [P] of the head's weight that each gets: less than 1 where it counts a second time what another loss
+            counts.
     """
 
     images: Tensor
@@ -42,7 +44,7 @@ class FaceViews:
     cameras: Cameras
     relative: Tensor
     expression: Tensor
-    share: float = 1.0
+    shares: Tensor
 
     def __post_init__(self) -> None:
         count, size = len(self.images), self.images.shape[2:]
@@ -51,11 +53,34 @@ class FaceViews:
                 f"expected alphas, weights {(count, *size)} and {count} cameras to match the images, got "
                 f"{tuple(self.alphas.shape)}, {tuple(self.weights.shape)} and {len(self.cameras)}"
             )
-        if len(self.relative) != count or len(self.expression) != count:
-            raise ValueError(f"expected {count} transforms and expressions, one a face view")
+        if any(len(rows) != count for rows in (self.relative, self.expression, self.shares)):
+            raise ValueError(f"expected {count} transforms, expressions and shares, one a face view")
 
     def __len__(self) -> int:
         return len(self.images)
+
+
+def join_faces(first: FaceViews, second: FaceViews) -> FaceViews:
+    """Two sets as one. A view drawn from it gives each set the weight that a view drawn from that set alone gives it.
+
+    Args:
+        first: Its cameras' model holds for both.
+        second: Smaller pictures are padded on the right and below, without weight.
+    """
+    count = len(first) + len(second)
+    width, height = (max(getattr(s.cameras, side) for s in (first, second)) for side in ("width", "height"))
+    parts = []
+    for views in (first, second):
+        beside = (0, width - views.cameras.width, 0, height - views.cameras.height)
+        maps = (pad(views.alphas, beside), pad(views.weights, beside))
+        shares = views.shares * count / len(views)
+        placed = (views.cameras.viewmats, views.cameras.Ks, views.relative, views.expression)
+        parts.append((pad(views.images, beside, value=GREY), *maps, *placed, shares))
+    images, alphas, weights, viewmats, Ks, relative, expression, shares = (
+        torch.cat(pair) for pair in zip(*parts, strict=True)
+    )
+    cameras = Cameras(viewmats, Ks, width, height, first.cameras.camera_model)
+    return FaceViews(images, alphas, weights, cameras, relative, expression, shares)
 
 
 @torch.no_grad()

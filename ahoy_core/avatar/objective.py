@@ -90,7 +90,7 @@ class Objective:
         return Terms(
             weights.body * body,
             weights.observed * observed,
-            weights.head * (self.faces.share if self.faces else 0.0) * self._head(chosen, generator),
+            weights.head * self._head(chosen, generator),
             weights.perceptual * self._perceptual(pictures, generator),
             regularisers(chosen, self.template, self.around, weights) + weights.pose_change * change,
             corrections.prior(rows, weights) if moving else change.new_zeros(()),
@@ -150,7 +150,7 @@ class Objective:
             gradient = self.config.weights.gradient
             loss = photometric(rendered.images[0], faces.images[view], weight, gradient, area)
             alpha = masked_l1(rendered.alphas[0], faces.alphas[view][None], weight, area)
-            total = total + (loss + self.config.weights.alpha * alpha) / len(chosen)
+            total = total + faces.shares[view] * (loss + self.config.weights.alpha * alpha) / len(chosen)
         return total
 
     def _perceptual(self, pictures: Sequence[tuple[Rendered, Shot]], generator: torch.Generator) -> Tensor:

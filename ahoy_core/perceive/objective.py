@@ -7,7 +7,15 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ahoy_core.perceive.ground import GROUND_SCALE, GROUND_SPREAD, SOLES, lowest_sole
+from ahoy_core.perceive.ground import (
+    BALANCE_SCALE,
+    BALANCE_SPREAD,
+    GROUND_SCALE,
+    GROUND_SPREAD,
+    SOLES,
+    imbalance,
+    lowest_sole,
+)
 from ahoy_core.perceive.normal import Normal, add_rows, empty_normal
 from ahoy_core.perceive.outline import (
     OUTLINE_SCALE,
@@ -135,6 +143,8 @@ def _seen_terms(
     if seen.ground is not None:
         height, _ = lowest_sole(landmarks, seen.ground)
         terms["ground"] = geman_mcclure(height.square(), GROUND_SCALE).sum() / GROUND_SPREAD**2
+        leaning = imbalance(landmarks, seen.ground).square().sum(-1)
+        terms["balance"] = geman_mcclure(leaning, BALANCE_SCALE).sum() / BALANCE_SPREAD**2
     return terms
 
 
@@ -230,6 +240,10 @@ def _add_ground(normal: Normal, objective: Objective, linear: Linearised) -> Non
     root = geman_mcclure_weight(height.square(), GROUND_SCALE).sqrt() / GROUND_SPREAD
     per_frame = normal.gradient.shape[1]
     _add_rows(normal, (root * height)[:, None, None], (root[:, None] * rows)[:, None, None], per_frame)
+    leaning = imbalance(linear.landmarks, ground)
+    rows = imbalance(linear.d_landmarks.permute(0, 3, 1, 2), ground).transpose(1, 2)
+    root = geman_mcclure_weight(leaning.square().sum(-1), BALANCE_SCALE).sqrt()[:, None] / BALANCE_SPREAD
+    _add_rows(normal, (root * leaning)[:, None], (root[..., None] * rows)[:, None], per_frame)
 
 
 def _add_outline(normal: Normal, objective: Objective, reduced: ReducedBody, state: State, person: Tensor) -> None:

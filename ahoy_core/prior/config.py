@@ -10,7 +10,7 @@ from ahoy_core.prior.solvers import Solver
 
 
 class IdentityConfig(BaseModel):
-    """Knobs of the fine-tuning.
+    """Knobs of the fine-tuning. Rank and steps cite their row: docs/prior.md, "Rank and steps".
 
     Attributes:
         rank: of the low-rank updates.
@@ -18,16 +18,20 @@ class IdentityConfig(BaseModel):
         batch: frames a step.
         lr: of the low-rank updates.
         token_lr: of the learned word.
+        pure_noise: share of the flow times that are 1 exactly, where the colours of a garment are decided.
+        mirror: learn from each frame's mirror image too, for sides that the video never shows.
         seed: of the frames, noise and times drawn.
     """
 
     model_config = ConfigDict(frozen=True)
 
     rank: int = Field(4, ge=1)
-    steps: int = Field(120, ge=1)
+    steps: int = Field(80, ge=1)
     batch: int = Field(8, ge=1)
-    lr: float = Field(2e-3, gt=0)
+    lr: float = Field(4e-3, gt=0)
     token_lr: float = Field(1e-2, gt=0)
+    pure_noise: float = Field(0.3, ge=0, le=1)
+    mirror: bool = True
     seed: int = 0
 
 

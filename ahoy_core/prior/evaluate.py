@@ -2,146 +2,37 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from ahoy_core.metrics.perceptual import Perceptual
+from ahoy_core.prior.clips import GARMENTS, REGIONS, Clips, context_of, load_clips, region_weight
 from ahoy_core.prior.conditioning import Context, held_tokens
 from ahoy_core.prior.config import InversionConfig
-from ahoy_core.prior.corpus.dress import KINDS, Kind
-from ahoy_core.prior.corpus.prompts import NEUTRAL
-from ahoy_core.prior.corpus.shards import read_shard, shards
+from ahoy_core.prior.corpus.dress import KINDS
+from ahoy_core.prior.corpus.shards import shards
 from ahoy_core.prior.corpus.wardrobe import SPLITS
-from ahoy_core.prior.inversion import clean_up, hallucinate
+from ahoy_core.prior.inversion import Hallucination, clean_up, hallucinate
+from ahoy_core.prior.scores import NO_PERCEPTUAL, colour_distance, gradient_energy, perceptual_distance, psnr
 from ahoy_core.prior.train.frames import autoencoder_psnr
 from ahoy_core.prior.video import VideoModel
 
-Array = NDArray[Any]
-
-REGIONS: Final[dict[str, tuple[Kind, ...]]] = {
-    "torso": ("upper",),
-    "legs": ("lower",),
-    "head": ("skin", "hair", "eyes", "brows"),
-}
-_FRONT, _BACK = 0.35, 0.3  # radians: how far a front or back view may be from straight on
-_HEAD_PLACE = 0.7  # of the body's height in [-1,1]: skin above it belongs to the head
+Repair = Callable[[Tensor, Context], Hallucination]
+"""Coarse latents [B,C,T,h,w] and all that is known (with coarse latents) -> a hallucinated video."""
 
 
-@dataclass(frozen=True)
-class Clips:
-    """N held-out clips of T frames; colours and alphas in [0,1].
-
-    Attributes:
-        frames: [N,T,3,H,W] over grey.
-        mask: [N,T,1,H,W].
-        coverage: [N,T,1,H,W], 1 where the imagined video showed the surface.
-        coarse: [N,T,3,H,W].
-        part: [N,T,H,W] index into `KINDS`, 255 outside.
-        body: [N,T,7,H/4,W/4].
-        azimuth: [N,T] radians.
-    """
-
-    frames: Tensor
-    mask: Tensor
-    coverage: Tensor
-    coarse: Tensor
-    part: Tensor
-    body: Tensor
-    azimuth: Tensor
-
-    def __len__(self) -> int:
-        return len(self.frames)
-
-    def take(self, count: int) -> Clips:
-        """The first clips."""
-        return Clips(**{name: value[:count] for name, value in self.__dict__.items()})
-
-    def views(self, frames: list[int]) -> Clips:
-        """The same clips with some of their frames."""
-        return Clips(**{name: value[:, frames] for name, value in self.__dict__.items()})
-
-
-def load_clips(shard: Path, limit: int, turning: bool = True) -> Clips:
-    """Evenly spread clips of a shard; with `turning`, those that start in front and show the back."""
-    names = ("image", "mask", "part", "coarse", "coverage", "body", "azimuth")
-    arrays, _ = read_shard(shard, names)
-    chosen = np.arange(len(arrays["azimuth"]))
-    if turning:
-        front = np.abs(_wrapped(arrays["azimuth"][:, 0])) < _FRONT
-        back = np.abs(_wrapped(arrays["azimuth"] - math.pi)).min(1) < _BACK
-        chosen = np.flatnonzero(front & back)
-    chosen = chosen[np.linspace(0, len(chosen) - 1, min(limit, len(chosen))).astype(int)]
-
-    def unit(name: str) -> Tensor:
-        return torch.from_numpy(arrays[name][chosen]).float() / 255
-
-    return Clips(
-        frames=unit("image").permute(0, 1, 4, 2, 3),
-        mask=unit("mask")[:, :, None],
-        coverage=unit("coverage")[:, :, None],
-        coarse=unit("coarse").permute(0, 1, 4, 2, 3),
-        part=torch.from_numpy(arrays["part"][chosen]),
-        body=torch.from_numpy(arrays["body"][chosen]).float() / 127,
-        azimuth=torch.from_numpy(arrays["azimuth"][chosen]),
-    )
-
-
-def _wrapped(angle: Array) -> Array:
-    return np.asarray((angle + math.pi) % (2 * math.pi) - math.pi)
-
-
-def region_weight(clips: Clips, name: str) -> Tensor:
-    """[N,T,1,H,W] alpha of a region; skin counts as head where the body's map says so."""
-    inside = torch.isin(clips.part, torch.tensor([KINDS.index(kind) for kind in REGIONS[name]]))
-    if name == "head":
-        place = clips.body[:, :, 3] / clips.body[:, :, 0].clamp(min=1e-3)
-        high = place.repeat_interleave(4, -1).repeat_interleave(4, -2) > _HEAD_PLACE
-        skin = clips.part == KINDS.index("skin")
-        inside &= ~skin | high
-    return inside[:, :, None] * clips.mask
-
-
-def psnr(made: Tensor, truth: Tensor, weight: Tensor) -> Tensor:
-    """PSNR in dB (peak 1) of pictures [...,3,H,W] under weights [...,1,H,W], one a picture; NaN where none counts."""
-    area = weight.sum((-1, -2, -3))
-    error = ((made - truth).square() * weight).sum((-1, -2, -3)) / (3 * area)
-    return torch.where(area >= 20, -10 * torch.log10(error.clamp(min=1e-10)), torch.full_like(area, math.nan))
-
-
-def gradient_energy(pictures: Tensor, weight: Tensor) -> float:
-    """Mean squared difference of neighbouring pixels inside weights: how sharp pictures are."""
-    across = (pictures.diff(dim=-1).square() * weight[..., 1:] * weight[..., :-1]).sum()
-    down = (pictures.diff(dim=-2).square() * weight[..., 1:, :] * weight[..., :-1, :]).sum()
-    return float((across + down) / (6 * weight.sum()).clamp(min=1))
-
-
-def context_of(
-    video: VideoModel, clips: Clips, held: Tensor | None, coarse: bool, frames: Tensor | None = None
-) -> Context:
-    """The prior's context for clips: which tokens are held [N,T,h/2,w/2], and whether coarse latents are given."""
-    known = video.encode((clips.frames if frames is None else frames).transpose(1, 2))
-    factor = clips.frames.shape[-1] // known.shape[-1]
-    seen = torch.nn.functional.avg_pool2d(torch.minimum(clips.coverage, clips.mask)[:, :, 0], factor)
-    return Context(
-        text=video.embed([NEUTRAL]).expand(len(clips), -1, -1),
-        known=None if held is None else known,
-        held=held,
-        body=clips.body,
-        azimuth=clips.azimuth,
-        coarse=video.encode(clips.coarse.transpose(1, 2)) if coarse else None,
-        coverage=seen if coarse else None,
-    )
-
-
-def held_out(video: VideoModel, corpus: Path, clips: int, splits: Sequence[str] = SPLITS) -> dict[str, Any]:
+def held_out(
+    video: VideoModel,
+    corpus: Path,
+    clips: int,
+    splits: Sequence[str] = SPLITS,
+    perceptual: Perceptual | None = None,
+) -> dict[str, Any]:
     """Figures on the first shard of each split that the prior was not trained on.
 
     Args:
@@ -149,6 +40,7 @@ def held_out(video: VideoModel, corpus: Path, clips: int, splits: Sequence[str] 
         corpus: folder of shards.
         clips: of each split, at most.
         splits: which; the training's own is left out.
+        perceptual: network; without one the figures say that its distances were not measured.
     """
     found: dict[str, Any] = {}
     for split in SPLITS:
@@ -165,9 +57,10 @@ def held_out(video: VideoModel, corpus: Path, clips: int, splits: Sequence[str] 
                 f"{made} over {base}, {region}": back[f"{made}/{region}"] - back[f"{base}/{region}"]
                 for made in ("mean", "sample")
                 for base in ("mirror", "colours")
-                for region in ("torso", "legs")
+                for region in GARMENTS
             },
-            "repaired": repaired(video, load_clips(paths[0], clips, turning=False), repair_methods(video)),
+            "perceptual": NO_PERCEPTUAL if perceptual is None else perceptual.name,
+            "repaired": repaired(video, load_clips(paths[0], clips, turning=False), repair_methods(video), perceptual),
             "cpu_seconds": sequence_seconds(video, turns.take(1)),
         }
     return found
@@ -232,18 +125,23 @@ def mean_colours(clips: Clips) -> Tensor:
 
 @torch.no_grad()
 def repaired(
-    video: VideoModel, clips: Clips, methods: Mapping[str, Callable[[Tensor, Context], Tensor]]
+    video: VideoModel,
+    clips: Clips,
+    methods: Mapping[str, Repair],
+    perceptual: Perceptual | None = None,
 ) -> dict[str, float]:
     """Coarse turns against the truth, before and after each method, on unobserved and on observed surface.
 
     Args:
         video: the prior.
         clips: held-out clips.
-        methods: name -> (coarse latents, context) -> latents.
+        methods: name -> repair.
+        perceptual: network.
 
     Returns:
         `METHOD/unobserved`, `METHOD/observed` mean PSNR in dB over frames (before compositing), `METHOD/gradient` on
-        unobserved surface as a share of the truth's.
+        unobserved surface as a share of the truth's, `METHOD/colour GARMENT` the mean over clips of the distance of a
+        garment's mean colour there to the truth's, and with a network `METHOD/perceptual` the mean distance there.
     """
     coverage = torch.minimum(clips.coverage, clips.mask)
     held = held_tokens(coverage[:, :, 0], clips.mask[:, :, 0])
@@ -253,43 +151,51 @@ def repaired(
     coarse = context.coarse
     assert coarse is not None
     results = {"coarse": clips.coarse, "coarse coded": video.decode(coarse).transpose(1, 2)}
-    results |= {name: video.decode(method(coarse, context)).transpose(1, 2) for name, method in methods.items()}
+    results |= {name: video.decode(method(coarse, context).latents).transpose(1, 2) for name, method in methods.items()}
     for name, pictures in results.items():
         figures[f"{name}/unobserved"] = float(torch.nanmean(psnr(pictures, clips.frames, unseen)))
         figures[f"{name}/observed"] = float(torch.nanmean(psnr(pictures, clips.frames, coverage)))
         figures[f"{name}/gradient"] = gradient_energy(pictures, unseen) / max(
             gradient_energy(clips.frames, unseen), 1e-9
         )
+        for garment in GARMENTS:
+            hidden = torch.minimum(region_weight(clips, garment), unseen)
+            distance = colour_distance(pictures, clips.frames, hidden)
+            figures[f"{name}/colour {garment}"] = float(torch.nanmean(distance))
+        if perceptual is not None:
+            flat = (pictures.flatten(0, 1), clips.frames.flatten(0, 1), unseen.flatten(0, 1))
+            figures[f"{name}/perceptual"] = float(torch.nanmean(perceptual_distance(perceptual, *flat)))
     return figures
 
 
-def repair_methods(video: VideoModel, seed: int = 0) -> dict[str, Callable[[Tensor, Context], Tensor]]:
+def repair_methods(video: VideoModel, seed: int = 0) -> dict[str, Repair]:
     """Clean-up in one and in eight steps, and RF-inversion at several depths."""
 
-    def cleaned(steps: int) -> Callable[[Tensor, Context], Tensor]:
-        def method(coarse: Tensor, context: Context) -> Tensor:
+    def cleaned(steps: int) -> Repair:
+        def method(coarse: Tensor, context: Context) -> Hallucination:
             noise = torch.randn(coarse.shape, generator=torch.Generator().manual_seed(seed))
-            return clean_up(video, noise, context, steps).latents
-
-        return method
-
-    def inverted(tau_max: float, gamma: float) -> Callable[[Tensor, Context], Tensor]:
-        config = InversionConfig(tau_max=tau_max, gamma=gamma, steps=6)
-
-        def method(coarse: Tensor, context: Context) -> Tensor:
-            neutral = video.embed([""]).expand(len(coarse), -1, -1)
-            generator = torch.Generator().manual_seed(seed)
-            blind = Context(context.text, context.known, context.held, context.body, context.azimuth)
-            return hallucinate(video, coarse, blind, neutral, config, generator).latents
+            return clean_up(video, noise, context, steps)
 
         return method
 
     return {
         "clean-up 1 step": cleaned(1),
         "clean-up 8 steps": cleaned(8),
-        "inversion 0.6": inverted(0.6, 0.0),
-        "inversion 0.8, gamma 0.5": inverted(0.8, 0.5),
+        "inversion 0.6": inverted(video, InversionConfig(tau_max=0.6, gamma=0.0, steps=6), seed),
+        "inversion 0.8, gamma 0.5": inverted(video, InversionConfig(tau_max=0.8, gamma=0.5, steps=6), seed),
     }
+
+
+def inverted(video: VideoModel, config: InversionConfig, seed: int = 0) -> Repair:
+    """RF-inversion as a repair: what was observed is held, coarse latents are gone through and not read."""
+
+    def method(coarse: Tensor, context: Context) -> Hallucination:
+        neutral = video.embed([""]).expand(len(coarse), -1, -1)
+        generator = torch.Generator().manual_seed(seed)
+        blind = Context(context.text, context.known, context.held, context.body, context.azimuth)
+        return hallucinate(video, coarse, blind, neutral, config, generator)
+
+    return method
 
 
 @torch.no_grad()
@@ -302,6 +208,6 @@ def sequence_seconds(video: VideoModel, clip: Clips) -> dict[str, float]:
         start = time.process_time()
         context = context_of(video, clip, held, coarse=True, frames=clip.coarse)
         assert context.coarse is not None
-        video.decode(method(context.coarse, context))
+        video.decode(method(context.coarse, context).latents)
         seconds[name] = time.process_time() - start
     return seconds

@@ -16,40 +16,15 @@ from torch import Tensor, nn
 from ahoy_core.formats.atomic import atomic_path
 from ahoy_core.prior.conditioning import Context
 from ahoy_core.prior.config import IdentityConfig
+from ahoy_core.prior.evidence import SEEN, Frames, holes_closed, with_mirrored
 from ahoy_core.prior.text import IDENTITY_PROMPT, IDENTITY_TOKEN, embedding_weight, identity_token_id
+from ahoy_core.prior.train.flow import random_tau
 from ahoy_core.prior.video import VideoModel
 
 ADAPTER: Final = "identity"
 _TARGETS: Final = ["to_q", "to_k", "to_v", "to_out.0", "ffn.net.0.proj", "ffn.net.2"]
 _FILES: Final = ("pytorch_lora_weights.safetensors", "pytorch_lora_weights_2.safetensors")
 _TOKEN_FILE: Final = "learned_embeds.safetensors"
-_SEEN: Final = 0.5  # share of a latent's pixels that must be the visible person for it to count
-
-
-@dataclass(frozen=True)
-class Frames:
-    """An unordered set of person images of one subject.
-
-    Attributes:
-        images: [N,3,H,W] in [0,1] over grey.
-        visible: [N,1,H,W] in [0,1] the visible part of the subject; everything else is kept out of the loss.
-        body: [N,7,H/4,W/4] `body_maps` of the fitted body in the same framing, or None.
-        azimuth: [N] radians, with `body`.
-    """
-
-    images: Tensor
-    visible: Tensor
-    body: Tensor | None = None
-    azimuth: Tensor | None = None
-
-    def __post_init__(self) -> None:
-        if self.images.ndim != 4 or self.visible.shape != (len(self.images), 1, *self.images.shape[2:]):
-            raise ValueError(
-                f"expected images [N,3,H,W] and visible [N,1,H,W], got {tuple(self.images.shape)} and "
-                f"{tuple(self.visible.shape)}"
-            )
-        if len(self.images) == 0 or not bool((self.visible > _SEEN).any()):
-            raise ValueError("expected at least one frame with a visible subject, got none; skip the identity stage")
 
 
 @dataclass(frozen=True)
@@ -128,6 +103,8 @@ def train_identity(
     """Fine-tunes the prior on a subject: E ||(z1 - z0) - v(z_tau, tau; "a [v] person")||^2 over visible latents.
 
     Each frame is a video of one frame, so nothing of the order is learned. The adapter and the word stay in the model.
+    A share of the times is 1 exactly: what colour a garment has is decided there and there alone, since at any lower
+    time the noisy latents tell it.
 
     Args:
         video: without an adapter.
@@ -139,11 +116,13 @@ def train_identity(
         FloatingPointError: when the loss is not finite.
     """
     add_identity(video, config.rank, config.seed)
+    frames = holes_closed(frames)
+    frames = with_mirrored(frames) if config.mirror else frames
     generator = torch.Generator().manual_seed(config.seed)
     with torch.no_grad():
         clean = video.encode(frames.images[:, :, None])
     size = frames.images.shape[-1] // clean.shape[-1]
-    weight = (nn.functional.avg_pool2d(frames.visible, size) >= _SEEN).float()[:, :, None]
+    weight = (nn.functional.avg_pool2d(frames.visible, size) >= SEEN).float()[:, :, None]
     word = _learned_word(video)
     updates = [p for network in experts(video) for p in network.parameters() if p.requires_grad]
     groups = [{"params": updates, "lr": config.lr}, {"params": [word], "lr": config.token_lr}]
@@ -152,7 +131,8 @@ def train_identity(
     with _spoken(video, word), _checkpointed(video):
         for step in range(config.steps):
             rows = torch.randint(len(clean), (config.batch,), generator=generator)
-            loss = _identity_loss(video, clean[rows], weight[rows], _context(video, frames, rows), generator)
+            tau = random_tau(generator, len(rows), config.pure_noise)
+            loss = _identity_loss(video, clean[rows], weight[rows], _context(video, frames, rows), tau, generator)
             if not bool(torch.isfinite(loss)):
                 raise FloatingPointError(f"expected a finite loss, got {float(loss.detach())} in step {step}; lower lr")
             optimizer.zero_grad()
@@ -214,10 +194,9 @@ def _context(video: VideoModel, frames: Frames, rows: Tensor) -> Context:
 
 
 def _identity_loss(
-    video: VideoModel, clean: Tensor, weight: Tensor, context: Context, generator: torch.Generator
+    video: VideoModel, clean: Tensor, weight: Tensor, context: Context, tau: Tensor, generator: torch.Generator
 ) -> Tensor:
-    """Equation 2 on a batch [B,C,1,h,w], averaged over visible latents."""
-    tau = torch.sigmoid(0.5 + 1.1 * torch.randn(len(clean), generator=generator))
+    """Equation 2 on a batch [B,C,1,h,w] at flow times tau [B], averaged over visible latents."""
     noise = torch.randn(clean.shape, generator=generator)
     level = tau.view(-1, 1, 1, 1, 1)
     velocity = video.velocity((1 - level) * clean + level * noise, tau, context)

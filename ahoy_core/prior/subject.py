@@ -8,8 +8,8 @@ from torch import Tensor
 from ahoy_core.body.model import BodyModel
 from ahoy_core.conventions import Cameras, person_image
 from ahoy_core.prior.bodymaps import body_maps, camera_azimuth
+from ahoy_core.prior.evidence import Frames
 from ahoy_core.prior.framing import HEIGHT, WIDTH, framing_Ks
-from ahoy_core.prior.identity import Frames
 
 
 def subject_frames(

@@ -8,8 +8,9 @@
 3. A screened Poisson solve over the texels joins the pieces of a part: gradients of the mirrored colours are kept,
    steps at their border are not.
 
-Seen texels keep their colours bit by bit. Skin is the one exception to "each part from itself": face and hands share
-it.
+All of it is done on colours from which the light they were seen in is divided out (`ahoy_core.texture.light`), and each
+texel is lit again where it lies. Seen texels keep their colours bit by bit. Skin is the one exception to "each part
+from itself": face and hands share it.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import numpy as np
 
 from ahoy_core.texture.atlas import ObservedAtlas
 from ahoy_core.texture.diffusion import Pull, solve_links, vertex_links
+from ahoy_core.texture.light import estimate_light, shading
 from ahoy_core.texture.links import mirror_texels, texel_links
 from ahoy_core.texture.parts import find_parts
 from ahoy_core.texture.rays import BoolArray, FloatArray, IntArray
@@ -41,7 +43,8 @@ class FilledAtlas:
 
     rgb [A,A,3] uint8, charts padded. mirrored and diffused are shares of the body's surface area; the rest was seen.
     part [N] uint8 of each texel, garments the borders that the colours showed. skin is the tone used for unseen hands
-    and face, skin_from tells whether it was "seen" or "neutral".
+    and face, skin_from tells whether it was "seen" or "neutral". light is the slope of brightness over the normal that
+    was estimated, zero where it was not.
     """
 
     rgb: IntArray
@@ -51,10 +54,16 @@ class FilledAtlas:
     garments: tuple[str, ...]
     skin: tuple[int, int, int]
     skin_from: str
+    light: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 def fill_atlas(
-    observed: ObservedAtlas, surface: Surface, texels: TexelMap, vertices: FloatArray, fill: FillKind = "both"
+    observed: ObservedAtlas,
+    surface: Surface,
+    texels: TexelMap,
+    vertices: FloatArray,
+    fill: FillKind = "both",
+    light: bool = True,
 ) -> FilledAtlas:
     """Complete an atlas.
 
@@ -65,35 +74,37 @@ def fill_atlas(
         vertices: [V,3] the body in canonical pose, facing -y, metres.
         fill: "both"; "harmonic", without step 1; or "symmetric", where step 2 is one colour a part (the median of what
             is known of it) and there is no step 3.
+        light: copy colours without the light they were seen in, and light them where they come to lie.
     """
     points = texels.points(vertices, surface.faces)
     normals = texel_normals(texels, vertices, surface)
+    areas = texels.areas(vertices, surface)
     seen = observed.coverage.ravel()[texels.flat] > 0
     colours = observed.rgb.reshape(-1, 3)[texels.flat].astype(np.float64)
-    areas = texels.areas(vertices, surface)
-    opposite = np.full(len(seen), -1)
-    if fill != "harmonic":
-        middle, spacing = float(vertices[:, 0].min() + vertices[:, 0].max()) / 2, float(np.sqrt(areas.mean()))
-        sources, wanted = np.flatnonzero(seen), np.flatnonzero(~seen)
-        opposite[wanted] = mirror_texels(points, normals, sources, wanted, middle, spacing)
-    known = seen | (opposite >= 0)
-    guess = np.where(seen[:, None], colours, colours[opposite])
-    skin, skin_from = skin_tone(surface, texels, vertices, normals, colours, seen)
-    value, weight = _at_vertices(surface, texels, guess, known)
     seen_value, seen_weight = _at_vertices(surface, texels, colours, seen)
     parts = find_parts(surface, vertices, seen_value, seen_weight > 0)
     part = parts.of_vertex[_nearest_vertex(surface, texels)]
+    slope = estimate_light(colours, normals, areas, part, seen) if light else np.zeros(3)
+    bright = shading(normals, slope)[:, None]
+    colours = colours / bright
+    opposite = np.full(len(seen), -1)
+    if fill != "harmonic":
+        opposite = _opposite(points, normals, areas, vertices, seen)
+    known = seen | (opposite >= 0)
+    guess = np.where(seen[:, None], colours, colours[opposite])
+    skin, skin_from = skin_tone(surface, texels, vertices, normals, colours, seen)
     if fill == "symmetric":
         for number in np.unique(part):
             own = part == number
             guess[own & ~known] = np.median(guess[own & known], axis=0) if (own & known).any() else NEUTRAL_CLOTH
         completed = guess
     else:
+        value, weight = _at_vertices(surface, texels, guess, known)
         base = _vertex_fill(surface, texels, vertices, value, weight, skin, parts.of_vertex)
         guess[~known] = base[~known]
         completed = _join(texels, points, normals, guess, colours, seen, known, part)
     rgb = np.zeros((texels.size * texels.size, 3), dtype=np.uint8)
-    rgb[texels.flat] = np.clip(np.rint(completed), 0, 255).astype(np.uint8)
+    rgb[texels.flat] = np.clip(np.rint(completed * bright), 0, 255).astype(np.uint8)
     total = max(float(areas.sum()), 1e-12)
     return FilledAtlas(
         rgb=pad_charts(rgb.reshape(texels.size, texels.size, 3), texels.chart),
@@ -103,7 +114,19 @@ def fill_atlas(
         garments=parts.found,
         skin=(int(skin[0]), int(skin[1]), int(skin[2])),
         skin_from=skin_from,
+        light=(float(slope[0]), float(slope[1]), float(slope[2])),
     )
+
+
+def _opposite(
+    points: FloatArray, normals: FloatArray, areas: FloatArray, vertices: FloatArray, seen: BoolArray
+) -> IntArray:
+    """[N] the seen texel opposite each unseen one; -1 for the others, and where none is."""
+    opposite = np.full(len(seen), -1)
+    middle, spacing = float(vertices[:, 0].min() + vertices[:, 0].max()) / 2, float(np.sqrt(areas.mean()))
+    sources, wanted = np.flatnonzero(seen), np.flatnonzero(~seen)
+    opposite[wanted] = mirror_texels(points, normals, sources, wanted, middle, spacing)
+    return opposite
 
 
 def _nearest_vertex(surface: Surface, texels: TexelMap) -> IntArray:

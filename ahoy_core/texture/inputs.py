@@ -24,7 +24,8 @@ class TextureConfig(BaseModel):
     fitted worse than this write nothing. align_px: largest shift along each axis, in pixels of a body 200 pixels tall,
     by which a frame is moved to agree with what is written (0: off). outlier_levels: colours further (of 255, in any
     channel) from what most frames show of a texel are not written (0: all are). fill: symmetry and harmonic filling
-    ("both"), or one of them alone ("symmetric", "harmonic"). canonical_height, canonical_width: pixels of the canonical
+    ("both"), or one of them alone ("symmetric", "harmonic"). light: fill with colours freed of the light they were seen
+    in, and light them where they come to lie. canonical_height, canonical_width: pixels of the canonical
     views. supersample: rays a pixel and axis in them.
     """
 
@@ -41,6 +42,7 @@ class TextureConfig(BaseModel):
     align_px: float = Field(4.0, ge=0, le=64)
     outlier_levels: float = Field(50.0, ge=0, le=255)
     fill: FillKind = "both"
+    light: bool = True
     canonical_height: int = Field(512, ge=16, le=4096)
     canonical_width: int = Field(384, ge=16, le=4096)
     supersample: int = Field(2, ge=1, le=8)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from ahoy_core.texture.rays import BoolArray, FloatArray, IntArray
@@ -23,8 +24,10 @@ WAIST_BAND = 0.1
 HEM_BAND = 0.22
 # A cut has to leave this many seen vertices on either side.
 LEAST_SIDE = 12
-# Two garments differ by this many levels (of 255, in some channel) ...
-LEAST_CONTRAST = 30.0
+# Lightness counts this much beside hue and saturation (CIE Lab): folds and shadows change it, garments all three.
+LIGHTNESS_WEIGHT = 0.3
+# Two garments are this far apart in such colours; one garment's upper and lower half in uneven light are at most 5.
+LEAST_CONTRAST = 8.0
 # ... and the cut explains at least this share of the colours' variance: prints and stripes do not.
 LEAST_EXPLAINED = 0.5
 # Cuts tried along a limb: one every centimetre or two.
@@ -99,7 +102,7 @@ def best_cut(along: FloatArray, colours: FloatArray) -> float | None:
     if len(along) < 2 * LEAST_SIDE:
         return None
     order = np.argsort(along, kind="stable")
-    along, colours = along[order], colours[order]
+    along, colours = along[order], _little_lightness(colours[order])
     total = float(np.square(colours - colours.mean(axis=0)).sum())
     if total <= 0:
         return None
@@ -108,7 +111,14 @@ def best_cut(along: FloatArray, colours: FloatArray) -> float | None:
     below, above = sums[cuts - 1] / count[cuts - 1, None], (sums[-1] - sums[cuts - 1]) / (len(along) - cuts)[:, None]
     between = cuts * (len(along) - cuts) / len(along) * np.square(below - above).sum(axis=1)
     best = int(between.argmax())
-    contrast = float(np.abs(below[best] - above[best]).max())
+    contrast = float(np.linalg.norm(below[best] - above[best]))
     if contrast < LEAST_CONTRAST or between[best] < LEAST_EXPLAINED * total:
         return None
     return float(along[cuts[best] - 1 : cuts[best] + 1].mean())
+
+
+def _little_lightness(colours: FloatArray) -> FloatArray:
+    """[N,3] CIE Lab colours of sRGB ones in 0..255, lightness counted less."""
+    lab = cv2.cvtColor((colours[None] / 255).astype(np.float32), cv2.COLOR_RGB2Lab)[0].astype(np.float64)
+    weighted: FloatArray = lab * (LIGHTNESS_WEIGHT, 1.0, 1.0)
+    return weighted

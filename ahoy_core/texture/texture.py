@@ -94,7 +94,7 @@ def build_texture(
     points = texels.points(vertices, surface.faces)
     clip = Clip(frames, visible, fit, body, surface, config, second)
     observed, log = accumulate(clip, texels, points, chosen, progress)
-    filled = fill_atlas(observed, surface, texels, vertices, config.fill)
+    filled = fill_atlas(observed, surface, texels, vertices, config.fill, config.light)
     rendered = canonical_views(
         surface,
         texels,
@@ -158,6 +158,7 @@ def _notes(
         "fill": FILL_WORDS[config.fill],
         "garment_borders": list(filled.garments),
         "skin": {"rgb": list(filled.skin), "from": filled.skin_from},
+        "light": [round(slope, 3) for slope in filled.light],
         "rule": config.rule,
         "frames_used": chosen,
         "texels_written": {str(t): count for t, count in log.written.items()},

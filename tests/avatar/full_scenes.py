@@ -98,6 +98,7 @@ def faces(count: int = 2) -> FaceViews:
         cameras=cameras,
         relative=torch.eye(4).expand(count, body().n_joints, 4, 4),
         expression=torch.zeros(count, body().n_expressions),
+        shares=torch.ones(count),
     )
 
 

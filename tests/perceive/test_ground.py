@@ -8,11 +8,23 @@ import numpy as np
 import pytest
 import torch
 
+from ahoy_core.body.keypoints import keypoints
 from ahoy_core.body.packaged import PackagedBody
+from ahoy_core.body.rotations import axis_angle_to_matrix
 from ahoy_core.conventions import look_at
+from ahoy_core.perceive import objective
 from ahoy_core.perceive.fit import fit_body
-from ahoy_core.perceive.ground import CLEARANCE, ground_from_camera, lowest_sole
+from ahoy_core.perceive.ground import (
+    BALANCE_SCALE,
+    CLEARANCE,
+    SOLES,
+    TRUNK,
+    ground_from_camera,
+    imbalance,
+    lowest_sole,
+)
 from ahoy_core.perceive.objective import FitConfig
+from ahoy_core.perceive.residuals import Observations, geman_mcclure_weight
 from tests.perceive.synthetic import average_betas, make_scene
 
 
@@ -41,17 +53,58 @@ def test_the_lowest_sole_is_level_when_standing_and_smooth_when_weight_shifts() 
     torch.testing.assert_close(slope[:, [29, 30, 31, 32]], lowest_sole(points, ground)[1].detach())
 
 
-def test_a_known_floor_tells_a_small_person_from_a_far_one(body: PackagedBody) -> None:
-    betas = average_betas(body)
-    betas[body.beta_names.index("height")] -= 0.25
+def standing(body: PackagedBody, betas: torch.Tensor) -> tuple[Observations, float, float]:
+    """A standing person, how far away, and how high the floor is."""
     scene = make_scene(body, frames=4, betas=betas, rise=0.0)
     floor = float(body(scene.pose, betas[None], scene.transl).vertices[..., 2].min()) - 0.012
     # The knees bend while the root stays, so the soles leave the floor: only the first frame stands.
     still = replace(scene.seen, **{k: getattr(scene.seen, k)[:1].repeat(3, *[1] * (getattr(scene.seen, k).ndim - 1))
                                    for k in ("points", "weights", "world", "world_weights", "visible")},
                     times=scene.seen.times[:3], shot=scene.seen.shot[:3])  # fmt: skip
+    return still, float(scene.transl[0, 1]), floor
+
+
+def test_a_known_floor_tells_a_small_person_from_a_far_one(body: PackagedBody) -> None:
+    betas = average_betas(body)
+    betas[body.beta_names.index("height")] -= 0.25
+    still, depth, floor = standing(body, betas)
     with_floor = replace(still, ground=torch.tensor([0.0, 0.0, 1.0, -floor]))
-    depth = float(scene.transl[0, 1])
     blind, told = (float(fit_body(body, seen, FitConfig()).transl[:, 1].mean()) - depth for seen in (still, with_floor))
     # 0.135 m was measured: the stature's prior still pulls.
     assert abs(told) < min(0.16, abs(blind))
+
+
+def test_balance_is_along_the_floor_and_moves_with_what_stands_on_it() -> None:
+    ground = torch.nn.functional.normalize(torch.tensor([0.1, -0.17, 0.98]).double(), dim=0)
+    ground = torch.cat([ground, torch.tensor([1.2]).double()])
+    landmarks = torch.randn(5, 33, 3, generator=torch.Generator().manual_seed(0)).double()
+    apart = imbalance(landmarks, ground)
+    torch.testing.assert_close(apart @ ground[:3], torch.zeros(5).double(), atol=1e-12, rtol=0)
+    torch.testing.assert_close(imbalance(landmarks + 3.0, ground), apart)
+    raised = landmarks.clone()
+    raised[:, list(TRUNK)] += 0.7 * ground[:3]
+    torch.testing.assert_close(imbalance(raised, ground), apart)
+    raised[:, list(SOLES), 0] -= 0.1
+    assert bool(((imbalance(raised, ground) - apart)[:, 0] > 0.09).all())
+
+
+def test_who_sits_is_left_alone() -> None:
+    sitting, leaning = geman_mcclure_weight(torch.tensor([0.45**2, 0.07**2]), BALANCE_SCALE)
+    # On a chair the feet are half a metre before the trunk.
+    assert float(sitting) < 0.05 * float(leaning)
+
+
+def test_who_stands_on_a_known_floor_does_not_lean(body: PackagedBody, monkeypatch: pytest.MonkeyPatch) -> None:
+    still, _, floor = standing(body, average_betas(body))
+    # A network that does not know where the camera looks takes its axis for level: here it looks down by 10 degrees.
+    tilt = axis_angle_to_matrix(torch.tensor([[0.17, 0.0, 0.0]]))[0]
+    seen = replace(still, world=still.world @ tilt.T, ground=torch.tensor([0.0, 0.0, 1.0, -floor]))
+
+    def lean() -> float:
+        fit = fit_body(body, seen, FitConfig())
+        landmarks = keypoints(body, body(fit.pose, fit.betas[None], fit.transl))
+        return float(imbalance(landmarks, seen.ground).norm(dim=-1).mean())
+
+    told = lean()
+    monkeypatch.setattr(objective, "BALANCE_SPREAD", 1e6)
+    assert told < 0.5 * lean()

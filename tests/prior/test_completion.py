@@ -5,21 +5,19 @@ from __future__ import annotations
 import pytest
 import torch
 
+from ahoy_core.prior.clips import Clips, region_weight
 from ahoy_core.prior.completion import Pictures, composited, repaint
 from ahoy_core.prior.config import InversionConfig, PriorConfig
 from ahoy_core.prior.corpus.dress import KINDS
 from ahoy_core.prior.evaluate import (
-    Clips,
     back_from_front,
-    gradient_energy,
     mean_colours,
     mirrored_front,
-    psnr,
-    region_weight,
     repair_methods,
     repaired,
 )
 from ahoy_core.prior.round_trip import round_trips
+from ahoy_core.prior.scores import gradient_energy, psnr
 from ahoy_core.prior.video import VideoModel
 
 FRAMES, HEIGHT, WIDTH = 2, 64, 32
@@ -112,6 +110,6 @@ def test_the_measurements_run_on_a_prior(embedded: VideoModel) -> None:
     assert figures["mirror/torso"] > 60
     repairs = repaired(embedded, clips(), {"clean-up 1 step": repair_methods(embedded)["clean-up 1 step"]})
     assert repairs["coarse/observed"] > 60 > repairs["coarse/unobserved"]
-    rows = round_trips(embedded, clips(), (8,), ("euler", "reversible_heun"), reference_steps=8)
-    errors = {row["solver"]: row["round_trip"] for row in rows}
+    trips = round_trips(embedded, clips(), (8,), ("euler", "reversible_heun"), reference_steps=8)
+    errors = {row["solver"]: row["round_trip"] for row in trips.rows}
     assert errors["reversible_heun"] < 1e-5 < errors["euler"]

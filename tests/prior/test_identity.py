@@ -10,8 +10,8 @@ from safetensors import safe_open
 
 from ahoy_core.prior.conditioning import Context
 from ahoy_core.prior.config import IdentityConfig
+from ahoy_core.prior.evidence import Frames
 from ahoy_core.prior.identity import (
-    Frames,
     add_identity,
     borrowed,
     experts,

@@ -9,7 +9,8 @@ from torch import Tensor
 
 from ahoy_core.prior.conditioning import Context, held_latents
 from ahoy_core.prior.config import IdentityConfig, InversionConfig
-from ahoy_core.prior.identity import Frames, train_identity
+from ahoy_core.prior.evidence import Frames
+from ahoy_core.prior.identity import train_identity
 from ahoy_core.prior.inversion import clean_up, hallucinate, invert, regenerate
 from ahoy_core.prior.solvers import Solver, SolverError, sigma_grid, solve
 from ahoy_core.prior.video import VideoModel

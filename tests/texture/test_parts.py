@@ -34,7 +34,7 @@ def test_trousers_never_get_the_shirts_colour(
     colours = np.where(low[:, None], TROUSERS, SHIRT)
     # From the front, down to a height that leaves only a strip of the trousers in sight, or none.
     seen = (points[:, 1] < 0) & (points[:, 2] > 0.84 * (1 - legs_seen))
-    filled = fill_atlas(observe(texels, colours, seen), surface, texels, rest, fill)
+    filled = fill_atlas(observe(texels, colours, seen), surface, texels, rest, fill, light=False)
     clear = ~seen & (np.abs(points[:, 2] - 0.84) > 0.07)  # this body's vertices are 7 cm apart
     legs = filled.rgb.reshape(-1, 3)[texels.flat][leg & clear].astype(float)
     # Neither red in the trousers nor, seen or not, anything on the way to it: at most what the neutral grey has.
@@ -66,6 +66,17 @@ def test_short_sleeves_end_where_the_skin_begins(surface: Surface, rest: np.ndar
     assert parts.found == ("sleeves",)
     assert (parts.of_vertex[bare] == FOREARM_PART).mean() > 0.8
     assert (parts.of_vertex[arm & (rest[:, 2] > 1.2)] == TRUNK_PART).all()
+
+
+def test_garments_of_nearly_one_brightness_are_told_apart_and_folds_are_not() -> None:
+    rng = np.random.default_rng(0)
+    along = rng.uniform(0, 1, 400)
+    folds = rng.uniform(0.6, 1.2, (400, 1))  # far more than the two garments differ
+    shirt, jeans = np.array([58.0, 98, 148]), np.array([88.0, 108, 124])
+    assert best_cut(along, folds * np.where(along[:, None] < 0.4, jeans, shirt)) == pytest.approx(0.4, abs=0.03)
+    assert best_cut(along, folds * shirt) is None
+    lit = 0.6 + 0.5 * along[:, None]  # a dress, brighter at the top
+    assert best_cut(along, lit * folds * shirt) is None
 
 
 def test_no_cut_is_seen_in_noise_in_stripes_or_in_nothing() -> None:

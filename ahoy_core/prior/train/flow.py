@@ -122,11 +122,11 @@ def flow_loss(model: FlowModel, batch: Batch, tau: Tensor, noise: Tensor) -> Ten
     return error.sum() / (LATENT_CHANNELS * batch.weight.sum()).clamp(min=1)
 
 
-def random_tau(generator: torch.Generator, size: int) -> Tensor:
-    """Flow times [B]: logit-normal, noisy ones more often, and a share of exactly 1."""
+def random_tau(generator: torch.Generator, size: int, pure: float = _PURE_NOISE) -> Tensor:
+    """Flow times [B]: logit-normal, noisy ones more often, and a share `pure` of exactly 1."""
     tau = torch.sigmoid(0.5 + 1.1 * torch.randn(size, generator=generator))
-    pure = torch.rand(size, generator=generator) < _PURE_NOISE
-    return torch.where(pure, torch.ones_like(tau), tau)
+    chosen = torch.rand(size, generator=generator) < pure
+    return torch.where(chosen, torch.ones_like(tau), tau)
 
 
 class FixedValidation:
