@@ -18,10 +18,10 @@ from ahoy_core.prior.transformer import build_transformer
 
 # Shares of the training in which a condition is there.
 _BODY: Final = 0.92
-_COARSE: Final = 0.5
+_COARSE: Final = 0.6
 _CAPTION, _NEUTRAL = 0.5, 0.25  # the rest has no text
 _OBSERVED, _OTHER = 0.8, 0.12  # observed frames held; one other whole frame; the rest holds nothing
-_PURE_NOISE: Final = 0.1  # tau = 1 exactly: one step from there is the posterior mean
+_PURE_NOISE: Final = 0.3  # tau = 1 exactly: one step from there is the posterior mean, which runs use most
 _FEW_FRAMES: Final = 0.6  # of the batches have half of the frames, and twice the clips
 _BACKGROUND_WEIGHT: Final = 0.12
 
