@@ -157,7 +157,7 @@ def _roles(config: CompleteConfig) -> Mapping[str, Role]:
 
 COMPLETE = Stage(
     "complete",
-    2,
+    3,
     CompleteConfig,
     ("perceive", "texture"),
     run_complete,

@@ -20,6 +20,9 @@ Repaint = Callable[[Pictures], Tensor]
 """Pictures with guesses -> [T,3,H,W] with better ones."""
 
 BASELINE: Final = "symmetric fill"
+MARGIN: Final = 0.05
+"""Share by which a fill must be closer than a simpler one: a few hundred pixels of two or three regions decide, and
+wins by less were worth nothing in whole runs (docs/prior.md)."""
 _MIN_OBSERVED: Final = 40  # surface points: with fewer there is nothing to hide
 _MIN_PIXELS: Final = 30
 
@@ -30,7 +33,7 @@ class SelfCheck:
 
     Attributes:
         errors: root mean square colour error in [0,1] on hidden pixels, by competitor.
-        winner: the one with the smallest error; the symmetric fill where nothing could be hidden, or on a tie.
+        winner: see `winner_of`; the symmetric fill where nothing could be hidden.
         regions: hidden regions that were scored.
         pixels: hidden pixels that were scored, in all.
         note: why, where there was no competition.
@@ -82,7 +85,7 @@ def self_check(
         points: [N,3] surface points in canonical pose.
         observed: [N] bool.
         fill: the symmetric fill: from what stays observed to pictures.
-        competitors: what repaints those pictures, by name.
+        competitors: what repaints those pictures, by name, the simplest first.
         rng: source of the regions.
         regions: how many.
     """
@@ -105,5 +108,17 @@ def self_check(
     if not scored:
         return SelfCheck({}, BASELINE, 0, 0, "no hidden region was large enough to be seen in the pictures")
     errors = {name: (value / total) ** 0.5 for name, value in squares.items()}
-    winner = min(errors, key=lambda name: (errors[name], name != BASELINE))
-    return SelfCheck(errors, winner, int(scored), int(total))
+    return SelfCheck(errors, winner_of(errors), int(scored), int(total))
+
+
+def winner_of(errors: Mapping[str, float]) -> str:
+    """The simplest of what is as good as anything: each must be closer than the winner before it by `MARGIN`.
+
+    Args:
+        errors: by name, the simplest first.
+    """
+    winner, *others = errors
+    for name in others:
+        if errors[name] < (1 - MARGIN) * errors[winner]:
+            winner = name
+    return winner

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from ahoy_core.prior.completion import Pictures
-from ahoy_core.prior.selfcheck import BASELINE, hidden_region, self_check
+from ahoy_core.prior.selfcheck import BASELINE, MARGIN, hidden_region, self_check, winner_of
 
 SIDE = 24
 
@@ -43,6 +43,15 @@ def test_a_tie_goes_to_the_symmetric_fill() -> None:
     everything = np.ones(SIDE * SIDE, dtype=bool)
     check = self_check(surface(), everything, fill, {"a copy": lambda given: given.frames}, np.random.default_rng(0))
     assert check.winner == BASELINE
+
+
+def test_a_win_by_little_goes_to_the_simpler_and_is_taken_from_the_winner_before() -> None:
+    little, much = 1 - 0.6 * MARGIN, 1 - 1.5 * MARGIN
+    assert winner_of({BASELINE: 0.1, "clean-up": 0.1 * little}) == BASELINE
+    assert winner_of({BASELINE: 0.1, "clean-up": 0.1 * much}) == "clean-up"
+    assert winner_of({BASELINE: 0.1, "clean-up": 0.1 * much, "inversion": 0.1 * much * little}) == "clean-up"
+    assert winner_of({BASELINE: 0.1, "clean-up": 0.1 * little, "inversion": 0.1 * much}) == "inversion"
+    assert winner_of({BASELINE: 0.1, "clean-up": 0.1 * much, "inversion": 0.1 * much**2}) == "inversion"
 
 
 def test_with_nothing_observed_there_is_no_competition() -> None:
