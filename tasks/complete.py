@@ -157,7 +157,7 @@ def _roles(config: CompleteConfig) -> Mapping[str, Role]:
 
 COMPLETE = Stage(
     "complete",
-    3,
+    4,
     CompleteConfig,
     ("perceive", "texture"),
     run_complete,

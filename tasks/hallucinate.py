@@ -144,7 +144,7 @@ def _roles(config: HallucinateConfig) -> Mapping[str, Role]:
 
 HALLUCINATE = Stage(
     "hallucinate",
-    1,
+    2,
     HallucinateConfig,
     ("complete", "coarse", "identity", "motions"),
     run_hallucinate,

@@ -123,7 +123,7 @@ def test_the_way_there_is_neutral_and_the_way_back_is_the_subjects(embedded: Vid
 def test_a_nan_from_the_model_is_an_error_with_its_cause(embedded: VideoModel) -> None:
     next(embedded.components.transformer.parameters()).fill_(float("nan"))
     context = Context(embedded.embed(["a person"]))
-    with pytest.raises(SolverError, match=r"not \(nan\) in midpoint step 0 at tau 0.*the model made it"):
+    with pytest.raises(SolverError, match=r"not \(nan\) in fireflow step 0 at tau 0.*the model made it"):
         hallucinate(embedded, noise(1), context, context.text, InversionConfig(), torch.Generator().manual_seed(0))
 
 
