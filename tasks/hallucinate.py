@@ -128,7 +128,7 @@ def read_supervision(folder: Path) -> Supervision:
         transl=tensors["transl"],
         cameras=Cameras(tensors["viewmats"], tensors["Ks"], told["width"], told["height"]),
         alphas=torch.from_numpy(arrays["alphas"]).float() / 255,
-        keeps_head=True,  # no face views come from the prior: nothing else shows the head from behind
+        keeps_head=True,  # the coarse avatar's own (see `composited`): nothing else shows it from behind
     )
 
 
@@ -144,7 +144,7 @@ def _roles(config: HallucinateConfig) -> Mapping[str, Role]:
 
 HALLUCINATE = Stage(
     "hallucinate",
-    2,
+    3,
     HallucinateConfig,
     ("complete", "coarse", "identity", "motions"),
     run_hallucinate,

@@ -30,12 +30,14 @@ class Pictures:
         mask: [T,1,H,W] alpha of the person, hidden parts included.
         coverage: [T,1,H,W] in [0,1], 1 where `frames` shows what was observed.
         moving: they follow each other as a video's frames do; views from four sides do not.
+        heads: [T,1,H,W] share of a pixel that is head, where what the prior makes is not taken; None: no such place.
     """
 
     frames: Tensor
     mask: Tensor
     coverage: Tensor
     moving: bool = True
+    heads: Tensor | None = None
 
     def __post_init__(self) -> None:
         shape = (len(self.frames), 1, *self.frames.shape[2:])
@@ -143,6 +145,11 @@ def _mostly_observed(pictures: Pictures) -> bool:
 
 
 def composited(generated: Tensor, pictures: Pictures) -> Tensor:
-    """Generated pictures with what was observed pasted over them: a hallucination never overwrites evidence."""
+    """Generated pictures with what was observed pasted over them: a hallucination never overwrites evidence.
+
+    Nor does it invent a face: heads stay the guess's own where the pictures say where they are.
+    """
     share = torch.minimum(pictures.coverage, pictures.mask)
+    if pictures.heads is not None:
+        share = torch.maximum(share, torch.minimum(pictures.heads, pictures.mask))
     return generated * (1 - share) + pictures.frames * share

@@ -42,7 +42,7 @@ class InversionConfig(BaseModel):
         mode: "steered" goes forward under the neutral prior without the identity adapter, so that only pose and
             silhouette are encoded, and back with it; "paper" reads equation 4 to the letter: the adapted field both
             ways, all the way to noise, nothing held.
-        solver: see `solvers`. By docs/prior.md, "Solvers", pictures are the same from every one of the second order from
+        solver: see `solvers`. By docs/prior.md, "Solvers", pictures are the same from any of second order from
             16 evaluations both ways on; this is the closest of the cheapest.
         steps: each way.
         tau_max: flow time at which the forward pass stops; 1 is pure noise.

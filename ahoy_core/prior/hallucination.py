@@ -39,7 +39,10 @@ def fine_cameras(cameras: Cameras, size: tuple[int, int] = (HEIGHT, WIDTH)) -> t
 def coarse_pictures(
     avatar: Avatar, body: BodyModel, sequence: PlannedSequence, size: tuple[int, int] = (HEIGHT, WIDTH)
 ) -> Pictures:
-    """The coarse avatar in a planned sequence, with the observed share of every pixel.
+    """The coarse avatar in a planned sequence, with the observed share of every pixel and where its head is.
+
+    The prior has never seen a real face: of a head it knows hair and back, and those it has put into the texture that
+    the coarse avatar was trained on.
 
     Args:
         avatar: the coarse avatar.
@@ -48,19 +51,19 @@ def coarse_pictures(
         size: height and width of the pictures.
     """
     cameras, factor = fine_cameras(sequence.cameras, size)
-    frames, masks, coverage = [], [], []
-    observed = avatar.observed[:, None].expand(-1, 3).contiguous()
+    frames, masks, shares = [], [], []
+    kinds = torch.stack([avatar.observed, avatar.head.to(avatar.observed), torch.zeros(len(avatar))], dim=1)
     for t in range(len(sequence.pose)):
         posed = avatar.pose(body, sequence.pose[t], sequence.transl[t])
         shown = render(posed.means, posed.covars, posed.opacities, posed.colors, cameras[t])
-        covered = render(posed.means, posed.covars, posed.opacities, observed, cameras[t], background=0.0)
+        shared = render(posed.means, posed.covars, posed.opacities, kinds, cameras[t], background=0.0)
         frames.append(shown.images[0])
         masks.append(shown.alphas[0])
-        coverage.append(covered.images[0, :1])
+        shares.append(shared.images[0, :2])
     picture, alpha, share = (
-        nn.functional.avg_pool2d(torch.stack(v).clamp(0, 1), factor) for v in (frames, masks, coverage)
+        nn.functional.avg_pool2d(torch.stack(v).clamp(0, 1), factor) for v in (frames, masks, shares)
     )
-    return Pictures(picture, alpha, share)
+    return Pictures(picture, alpha, share[:, :1], heads=share[:, 1:])
 
 
 def sequence_context(body: BodyModel, betas: Tensor, sequence: PlannedSequence) -> tuple[Tensor, Tensor]:
@@ -93,7 +96,7 @@ def as_supervision(sequence: PlannedSequence, frames: Tensor, pictures: Pictures
 
     Args:
         sequence: motion pose and cameras.
-        frames: [T,3,H,W] hallucinated, observed pixels pasted over.
+        frames: [T,3,H,W] hallucinated, observed pixels and heads pasted over.
         pictures: the coarse render, for coverage and alpha.
     """
     return Supervision(
@@ -106,5 +109,5 @@ def as_supervision(sequence: PlannedSequence, frames: Tensor, pictures: Pictures
         transl=sequence.transl,
         cameras=fine_cameras(sequence.cameras, (frames.shape[2], frames.shape[3]))[0],
         alphas=pictures.mask[:, 0],
-        keeps_head=True,  # no face views come from the prior: nothing else shows the head from behind
+        keeps_head=True,  # the coarse avatar's own (see `composited`): nothing else shows it from behind
     )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -47,6 +49,15 @@ def test_held_regions_come_back_through_the_autoencoder_only(embedded: VideoMode
     assert float((made[1] - coded[1]).abs().mean()) > 0.02
     pasted = composited(made, given)
     assert torch.equal(pasted[0, :, :32], given.frames[0, :, :32]) and torch.equal(pasted[1], made[1])
+
+
+def test_a_head_is_never_the_priors() -> None:
+    given, made = pictures(), torch.rand(FRAMES, 3, HEIGHT, WIDTH)
+    heads = torch.zeros_like(given.mask)
+    heads[1, :, :20] = 1
+    pasted = composited(made, replace(given, heads=heads))
+    assert torch.equal(pasted[1, :, :20], given.frames[1, :, :20]) and torch.equal(pasted[1, :, 20:], made[1, :, 20:])
+    assert not torch.equal(composited(made, given)[1, :, :20], given.frames[1, :, :20])
 
 
 def test_the_seed_decides(embedded: VideoModel) -> None:
