@@ -152,12 +152,13 @@ def main() -> None:
     torch.set_num_threads(arguments.threads)
     start = time.process_time()
     video = load_video(arguments.prior)
+    loading = time.process_time() - start
     perceptual = perceptual_network(Fills())
     found: dict[str, Any] = json.loads(arguments.json.read_text(encoding="utf-8")) if arguments.json.exists() else {}
     found |= {
         "machine": machine(),
         "threads": arguments.threads,
-        "prior_load_cpu_seconds": round(time.process_time() - start, 2),
+        "prior_load_cpu_seconds": round(loading, 2),
     }
     if arguments.corpus is not None and "held-out" in arguments.parts:
         found["held_out"] = held_out(video, arguments.corpus, arguments.clips, arguments.splits, perceptual)

@@ -81,7 +81,8 @@ def light_words(slope: Sequence[float]) -> str:
     """
     if not any(slope):
         return "not estimated"
-    left, back, up = (shading(np.eye(3), np.asarray(slope)) / shading(-np.eye(3), np.asarray(slope))).tolist()
+    axes, light = np.eye(3), np.asarray(slope)
+    left, back, up = (shading(axes, light) / shading(-axes, light)).tolist()
     return f"back {back:.0%} as bright as front, left {left:.0%} as right, what faces up {up:.0%} as what faces down"
 
 

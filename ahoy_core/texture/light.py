@@ -18,7 +18,7 @@ from ahoy_core.texture.parts import FOOT_PART, HAND_PART, HEAD_PART
 from ahoy_core.texture.rays import BoolArray, FloatArray, IntArray
 
 # Believed slope for a person seen from one side alone (whose seen normals have a mean of some 0.6): what faces away
-# from the camera has about three quarters of the brightness of what faces it.
+# from the camera has two thirds of the brightness of what faces it.
 BEHIND = 0.2
 # Weight of the belief against the mean over texels.
 BELIEF = 0.1
