@@ -49,7 +49,8 @@ def run_complete(config: CompleteConfig, ctx: StageContext) -> StageOutput:
     betas = load_npz(ctx.inputs["perceive"] / "body.npz", ["betas"])["betas"]
     observed = ObservedAtlas(atlas["observed_rgb"], atlas["coverage"], atlas["source_frame"])
     video = open_prior(ctx.prior, ctx.fills)
-    fill = CanonicalFill(body, betas, observed, video.size)
+    settings = json.loads((ctx.inputs["texture"] / "texture.json").read_text(encoding="utf-8"))["filled_with"]
+    fill = CanonicalFill(body, betas, observed, video.size, **settings)
     check = check_prior(video, fill, config.seed, config.regions)
     winner = check.winner if config.believe == "winner" else _best_prior(video, check.errors)
     used = winner != BASELINE
@@ -157,7 +158,7 @@ def _roles(config: CompleteConfig) -> Mapping[str, Role]:
 
 COMPLETE = Stage(
     "complete",
-    4,
+    5,
     CompleteConfig,
     ("perceive", "texture"),
     run_complete,

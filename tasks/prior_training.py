@@ -67,6 +67,7 @@ def train_autoencoder(
         FramePool,
         autoencoder_loss,
         autoencoder_psnr,
+        fitted_readout,
         latent_statistics,
         start_from_principal_components,
     )
@@ -103,6 +104,7 @@ def train_autoencoder(
         if not decoder_only:
             mean, std = latent_statistics(model, corpus)
             model.register_to_config(latents_mean=mean, latents_std=std)
+            model.register_to_config(cell_readout=fitted_readout(model, corpus))
         save_autoencoder(folder / AUTOENCODER, model)
         if decoder_only and (folder / "prior").exists():
             save_autoencoder(folder / "prior" / "vae", model)
@@ -152,7 +154,8 @@ def train_flow(
     torch.manual_seed(1)
     work = folder / "flow"
     work.mkdir(parents=True, exist_ok=True)
-    model = FlowModel(*size)
+    vae = FrameAutoencoder.from_pretrained(folder / AUTOENCODER)
+    model = FlowModel(vae.cell_readout, *size)
     state = new_state(model.train(), seed=1, plain=_FLOW_VECTORS)
     if (work / _STATE).exists():
         load_state(state, work / _STATE)
@@ -163,7 +166,9 @@ def train_flow(
 
     def evaluate() -> Row:
         clips = pool.refresh()
-        return {"train_clips": clips, **{f"loss_{split}": fixed.loss(model) for split, fixed in held.items()}}
+        losses = {f"loss_{split}": fixed.loss(model) for split, fixed in held.items()}
+        heard = {f"heard_{split}": fixed.heard(model) for split, fixed in held.items()}
+        return {"train_clips": clips, **losses, **heard}
 
     run(
         state,
@@ -174,5 +179,4 @@ def train_flow(
         evaluate,
     )
     with averaged(state):
-        vae = FrameAutoencoder.from_pretrained(folder / AUTOENCODER)
         save_prior(folder / "prior", model.transformer, vae, model.text_encoder, model.tokenizer)

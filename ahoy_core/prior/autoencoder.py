@@ -43,6 +43,7 @@ class FrameAutoencoder(ModelMixin, ConfigMixin):
         widths: channels at 1/2, 1/4 and 1/8 of the size.
         latents_mean: per channel, over the corpus; `normalized` latents have mean 0.
         latents_std: per channel; `normalized` latents have standard deviation 1.
+        cell_readout: [12][C+1], the linear map from a normalized latent to the mean colours of its four cells.
     """
 
     @register_to_config
@@ -52,6 +53,7 @@ class FrameAutoencoder(ModelMixin, ConfigMixin):
         widths: Sequence[int] = (32, 64, 128),
         latents_mean: Sequence[float] | None = None,
         latents_std: Sequence[float] | None = None,
+        cell_readout: Sequence[Sequence[float]] | None = None,
     ) -> None:
         super().__init__()
         half, quarter, eighth = widths
@@ -113,6 +115,17 @@ class FrameAutoencoder(ModelMixin, ConfigMixin):
         """The inverse of `normalized`."""
         mean, std = self._statistics(latents)
         return latents * std + mean
+
+    @property
+    def cell_readout(self) -> Tensor:
+        """[12,C+1], see `cell_colours`.
+
+        Raises:
+            ValueError: when the configuration has none.
+        """
+        if self.config.cell_readout is None:
+            raise ValueError("expected cell_readout in the configuration, got none; finish the autoencoder's training")
+        return torch.tensor(self.config.cell_readout)
 
     def _statistics(self, like: Tensor) -> tuple[Tensor, Tensor]:
         if self.config.latents_mean is None or self.config.latents_std is None:

@@ -19,7 +19,7 @@ from ahoy_core.prior.selfcheck import SelfCheck, self_check
 from ahoy_core.prior.video import VideoModel
 from ahoy_core.texture.atlas import ObservedAtlas
 from ahoy_core.texture.canonical import canonical_views
-from ahoy_core.texture.fill import fill_atlas
+from ahoy_core.texture.fill import FillKind, fill_atlas
 from ahoy_core.texture.surface import Surface
 from ahoy_core.texture.texels import texel_map
 from ahoy_core.texture.texture import canonical_vertices
@@ -45,6 +45,8 @@ class CanonicalFill:
         betas: [S] the subject's shape.
         observed: the atlas of the video.
         size: height and width of the views, pixels; `VideoModel.size`.
+        fill: as the texture was filled, see `fill_atlas`.
+        light: likewise.
 
     Attributes:
         points: [N,3] of the atlas' texels in canonical pose, metres.
@@ -54,9 +56,15 @@ class CanonicalFill:
     """
 
     def __init__(
-        self, body: BodyModel, betas: Array, observed: ObservedAtlas, size: tuple[int, int] = (HEIGHT, WIDTH)
+        self,
+        body: BodyModel,
+        betas: Array,
+        observed: ObservedAtlas,
+        size: tuple[int, int] = (HEIGHT, WIDTH),
+        fill: FillKind = "both",
+        light: bool = True,
     ) -> None:
-        self._atlas, self._size = observed, size
+        self._atlas, self._size, self._fill, self._light = observed, size, fill, light
         self._surface = Surface.of(body)
         self._texels = texel_map(self._surface, len(observed.coverage))
         self._vertices = canonical_vertices(body, betas)
@@ -78,7 +86,7 @@ class CanonicalFill:
             coverage=np.where(known, self._atlas.coverage, 0).astype(np.float32),
             source_frame=np.where(known, self._atlas.source_frame, -1).astype(np.int32),
         )
-        filled = fill_atlas(atlas, self._surface, self._texels, self._vertices)
+        filled = fill_atlas(atlas, self._surface, self._texels, self._vertices, self._fill, self._light)
         made = canonical_views(self._surface, self._texels, self._vertices, atlas, filled.rgb, *self._size)
         rgba = torch.from_numpy(made.views).permute(0, 3, 1, 2).float() / 255
         alpha = rgba[:, 3:]

@@ -41,11 +41,10 @@ class Pictures:
 
     def __post_init__(self) -> None:
         shape = (len(self.frames), 1, *self.frames.shape[2:])
-        if self.mask.shape != shape or self.coverage.shape != shape:
-            raise ValueError(
-                f"expected mask and coverage {shape} for these frames, got {tuple(self.mask.shape)} and "
-                f"{tuple(self.coverage.shape)}"
-            )
+        for name in ("mask", "coverage", "heads"):
+            value = getattr(self, name)
+            if value is not None and value.shape != shape:
+                raise ValueError(f"expected {name} {list(shape)} for these frames, got {list(value.shape)}")
 
 
 def pose_context(body: BodyModel, vertices: Tensor, root_rotations: Tensor, cameras: Cameras) -> tuple[Tensor, Tensor]:

@@ -1,4 +1,4 @@
-"""What the prior's transformer sees beside noisy latents: body maps, azimuth, coarse latents, and what is held."""
+"""What the prior's transformer sees beside noisy latents: body, azimuth, coarse latents, what is held, its colours."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from ahoy_core.prior.bodymaps import CELL, CHANNELS
+from ahoy_core.prior.carry import CARRIED_CHANNELS, FACTOR, carried_colours
 
-FACTOR: Final = 8  # pixels a latent, along each axis
 PATCH: Final = 2  # latents a token, along each axis
 LATENT_CHANNELS: Final = 16
 _BODY: Final = CHANNELS * (FACTOR // CELL) ** 2  # 28: the maps' cells of one latent
@@ -18,7 +18,7 @@ _BODY: Final = CHANNELS * (FACTOR // CELL) ** 2  # 28: the maps' cells of one la
 _FLAGS: Final = 7
 COARSE_START: Final = LATENT_CHANNELS + _BODY + 3
 """First channel of the coarse latents in the transformer's input."""
-INPUT_CHANNELS: Final = LATENT_CHANNELS + _BODY + LATENT_CHANNELS + _FLAGS
+INPUT_CHANNELS: Final = LATENT_CHANNELS + _BODY + LATENT_CHANNELS + _FLAGS + CARRIED_CHANNELS
 
 
 @dataclass(frozen=True)
@@ -77,8 +77,13 @@ def timesteps(tau: Tensor, latents: Tensor, held: Tensor | None) -> Tensor:
     return 1000 * grid.flatten(1)
 
 
-def transformer_input(latents: Tensor, context: Context) -> Tensor:
+def transformer_input(latents: Tensor, context: Context, readout: Tensor) -> Tensor:
     """Stacks latents [B,16,T,h,w] and the context to the transformer's input [B,INPUT_CHANNELS,T,h,w].
+
+    Args:
+        latents: noisy ones.
+        context: what is known.
+        readout: [12,17] of the autoencoder, by which colours are read off held latents (`cell_colours`).
 
     Raises:
         ValueError: when a part of the context has another size.
@@ -103,7 +108,10 @@ def transformer_input(latents: Tensor, context: Context) -> Tensor:
     if context.coverage is not None:
         flags[:, 2] = 1
         flags[:, 3] = context.coverage
-    return torch.cat([hold(latents, context), body, coarse, flags], 1)
+    told = latents.new_zeros(batch, CARRIED_CHANNELS, frames, height, width)
+    if context.body is not None and context.known is not None and context.held is not None:
+        told = carried_colours(context.known, context.held, context.body, readout).to(latents)
+    return torch.cat([hold(latents, context), body, coarse, flags, told], 1)
 
 
 def held_tokens(coverage: Tensor, mask: Tensor, threshold: float = 0.97) -> Tensor:

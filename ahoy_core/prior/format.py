@@ -68,6 +68,9 @@ def save_prior(folder: Path, transformer: Any, vae: FrameAutoencoder, text_encod
     transformer.save_pretrained(folder / "transformer")
     save_autoencoder(folder / "vae", vae)
     text_encoder.save_pretrained(folder / "text_encoder")
+    # A tokenizer notes down how its last call padded and cut; that belongs to the call.
+    tokenizer.backend_tokenizer.no_padding()
+    tokenizer.backend_tokenizer.no_truncation()
     tokenizer.save_pretrained(folder / "tokenizer")
     FlowMatchEulerDiscreteScheduler(**_SCHEDULER).save_pretrained(folder / "scheduler")
     index = {

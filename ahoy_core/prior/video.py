@@ -108,7 +108,7 @@ class EmbeddedVideo:
         times = _times(tau, latents)
         network = self.components.transformer
         dtype = _input_dtype(network)
-        stacked = transformer_input(latents, context).to(dtype)
+        stacked = transformer_input(latents, context, self.components.vae.cell_readout).to(dtype)
         steps = timesteps(times, latents, context.held)
         velocity = network(stacked, steps, context.text.to(dtype), return_dict=False)[0].to(latents)
         return velocity if context.held is None else hold(velocity, replace(context, known=torch.zeros_like(latents)))

@@ -156,6 +156,7 @@ def _notes(
         "mirrored_share": filled.mirrored,
         "diffused_share": filled.diffused,
         "fill": FILL_WORDS[config.fill],
+        "filled_with": {"fill": config.fill, "light": config.light},
         "garment_borders": list(filled.garments),
         "skin": {"rgb": list(filled.skin), "from": filled.skin_from},
         "light": [round(slope, 3) for slope in filled.light],

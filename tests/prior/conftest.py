@@ -20,7 +20,9 @@ def embedded_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An untrained embedded prior of 12k parameters."""
     torch.manual_seed(0)
     folder = tmp_path_factory.mktemp("embedded")
-    vae = FrameAutoencoder(widths=(8, 8, 8), latents_mean=[0.1] * 16, latents_std=[1.5] * 16)
+    vae = FrameAutoencoder(
+        widths=(8, 8, 8), latents_mean=[0.1] * 16, latents_std=[1.5] * 16, cell_readout=[[0.2] * 17] * 12
+    )
     tokenizer = build_tokenizer()
     save_prior(folder, build_transformer(24, 1, 2), vae, build_text_encoder(len(tokenizer)), tokenizer)
     return folder

@@ -67,9 +67,11 @@ def test_the_seed_decides(embedded: VideoModel) -> None:
     assert not torch.equal(one, two)
 
 
-def test_masks_of_another_size_are_refused() -> None:
-    with pytest.raises(ValueError, match="mask and coverage"):
-        Pictures(torch.rand(2, 3, 8, 8), torch.rand(2, 1, 8, 8), torch.rand(2, 8, 8))
+@pytest.mark.parametrize("name", ["mask", "coverage", "heads"])
+def test_masks_of_another_size_are_refused(name: str) -> None:
+    fitting = torch.rand(2, 1, 8, 8)
+    with pytest.raises(ValueError, match=f"expected {name}"):
+        Pictures(torch.rand(2, 3, 8, 8), **{"mask": fitting, "coverage": fitting, name: torch.rand(2, 8, 8)})
 
 
 def clips() -> Clips:

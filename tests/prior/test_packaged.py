@@ -62,6 +62,31 @@ def test_it_is_trained(video: EmbeddedVideo) -> None:
     assert float(outside) < 0.05 and float(inside) > 3 * float(outside), (float(inside), float(outside))
 
 
+@torch.no_grad()
+def test_it_hears_words(video: EmbeddedVideo) -> None:
+    """From words and a bare body alone, whose top and trousers are named red and blue has them so, and the reverse."""
+    body = load_packaged_body()
+    vertices = torch.from_numpy(canonical_vertices(body, body.default_betas.numpy()))
+    cameras = canonical_cameras(vertices, *video.size)
+    maps, azimuth = pose_context(body, vertices.expand(4, -1, -1), torch.eye(3).expand(4, 3, 3), cameras)
+    size = (1, LATENT_CHANNELS, 4, video.size[0] // FACTOR, video.size[1] // FACTOR)
+    noise = torch.randn(size, generator=torch.Generator().manual_seed(0))
+
+    def redness(prompt: str) -> torch.Tensor:
+        """Red less blue of the torso and of the legs."""
+        made = video.decode(
+            clean_up(video, noise, Context(video.embed([prompt]), body=maps, azimuth=azimuth), 1).latents
+        )
+        cells = torch.nn.functional.avg_pool2d(made[0].transpose(0, 1), CELL)
+        height, inside = maps[0, :, 3], maps[0, :, 0] > 0.9
+        bands = (inside & (height > 0.15) & (height < 0.5), inside & (height > -0.7) & (height < -0.15))
+        return torch.stack([(cells[:, 0] - cells[:, 2])[band].mean() for band in bands])
+
+    one, other = redness("a person, red top, blue trousers"), redness("a person, blue top, red trousers")
+    difference = (one - other) * torch.tensor([1, -1])
+    assert float(difference.min()) > 0.15, (one, other)
+
+
 def test_it_is_part_of_the_package() -> None:
     text = (Path(__file__).resolve().parents[2] / "pyproject.toml").read_text()
     assert '"prior/*"' in text and '"prior/*/*"' in text

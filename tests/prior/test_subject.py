@@ -18,6 +18,11 @@ from ahoy_core.prior.subject import subject_frames
 from ahoy_core.prior.transformer import build_transformer
 from ahoy_core.prior.video import VideoModel
 from ahoy_core.texture.atlas import ObservedAtlas
+from ahoy_core.texture.canonical import canonical_views
+from ahoy_core.texture.fill import FillKind, fill_atlas
+from ahoy_core.texture.surface import Surface
+from ahoy_core.texture.texels import texel_map
+from ahoy_core.texture.texture import canonical_vertices
 
 
 @pytest.fixture(scope="module")
@@ -73,6 +78,27 @@ def test_the_fill_shows_what_is_kept_and_covers_only_that(body: PackagedBody) ->
     assert shown[0] > shown[1] + 0.3
 
 
+@pytest.mark.parametrize("settings", [("both", True), ("both", False), ("harmonic", False)])
+def test_the_fill_that_competes_is_the_texture_stages_own(body: PackagedBody, settings: tuple[FillKind, bool]) -> None:
+    surface, betas = Surface.of(body), body.default_betas.numpy()
+    half, texels = atlas(), texel_map(surface, 64)
+    vertices = canonical_vertices(body, betas)
+    points = texels.points(vertices, surface.faces)
+    seen = np.zeros(64 * 64, dtype=bool)
+    seen[texels.flat] = points[:, 1] < 0
+    half.coverage[~seen.reshape(64, 64)] = 0
+    # A lit front: brighter on one side, so that light and kind of fill both matter.
+    half.rgb.reshape(-1, 3)[texels.flat] = np.clip(130 + 300 * points[:, :1], 0, 255).astype(np.uint8)
+    kind, light = settings
+    filled = fill_atlas(half, surface, texels, vertices, kind, light)
+    expected = canonical_views(surface, texels, vertices, half, filled.rgb, HEIGHT, WIDTH).views
+    fill = CanonicalFill(body, betas, half, fill=kind, light=light)
+    made = fill(torch.from_numpy(fill.observed))
+    inside = made.mask[:, 0] > 0.999
+    colours = torch.from_numpy(expected[..., :3]).float() / 255
+    torch.testing.assert_close(made.frames.permute(0, 2, 3, 1)[inside], colours[inside], rtol=0, atol=2e-3)
+
+
 def test_the_check_runs_with_the_prior_and_names_a_winner(body: PackagedBody, embedded: VideoModel) -> None:
     fill = CanonicalFill(body, body.default_betas.numpy(), atlas())
     check = check_prior(embedded, fill, regions=1)
@@ -89,7 +115,9 @@ def test_training_starts_where_pure_noise_becomes_the_coarse_latents() -> None:
     context = Context(torch.zeros(1, 4, 64), coarse=coarse, coverage=torch.zeros(1, 2, 8, 4))
     with torch.no_grad():
         steps = timesteps(torch.ones(1), noise, None)
-        velocity = transformer(transformer_input(noise, context), steps, context.text, return_dict=False)[0]
+        velocity = transformer(
+            transformer_input(noise, context, torch.zeros(12, 17)), steps, context.text, return_dict=False
+        )[0]
     error = (velocity - (noise - coarse)).square().mean() / (noise - coarse).square().mean()
     # The last normalisation rescales: a tenth in power, against 1 for an untrained network.
     assert float(error) < 0.1

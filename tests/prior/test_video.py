@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from ahoy_core.prior.conditioning import Context, held_latents, hold, timesteps, transformer_input
-from ahoy_core.prior.format import PriorFormatError
+from ahoy_core.prior.format import PriorFormatError, save_prior
 from ahoy_core.prior.text import IDENTITY_PROMPT, MAX_TOKENS
 from ahoy_core.prior.video import EmbeddedVideo, VideoModel, WanVideo, load_video
 
@@ -37,6 +37,14 @@ def test_the_folder_is_a_diffusers_pipeline(embedded_folder: Path) -> None:
     for name in ("transformer", "vae", "text_encoder", "tokenizer", "scheduler"):
         assert any((embedded_folder / name).iterdir()), name
     assert not list(embedded_folder.rglob("*.bin")) and not list(embedded_folder.rglob("*.pt"))
+
+
+def test_a_tokenizer_is_saved_without_what_its_last_call_did(embedded: EmbeddedVideo, tmp_path: Path) -> None:
+    parts = embedded.components
+    embedded.embed(["a person, red top"])
+    save_prior(tmp_path, parts.transformer, parts.vae, parts.text_encoder, parts.tokenizer)
+    saved = json.loads((tmp_path / "tokenizer" / "tokenizer.json").read_text())
+    assert saved["padding"] is None and saved["truncation"] is None
 
 
 def test_forms_are_told_apart(embedded_folder: Path, wan_folders: dict[str, Path]) -> None:
@@ -137,10 +145,11 @@ def test_held_tokens_stand_still_and_are_seen_clean(embedded: VideoModel) -> Non
 
 def test_every_condition_reaches_the_input(embedded: VideoModel) -> None:
     full = context(embedded)
-    stacked = transformer_input(latents(), full)
+    readout = embedded.components.vae.cell_readout
+    stacked = transformer_input(latents(), full, readout)
     for name in ("body", "azimuth", "coarse", "coverage"):
         changed = Context(**{**full.__dict__, name: getattr(full, name) + 0.5})
-        assert not torch.equal(transformer_input(latents(), changed), stacked), name
+        assert not torch.equal(transformer_input(latents(), changed, readout), stacked), name
 
 
 def test_half_a_condition_is_refused(embedded: VideoModel) -> None:
@@ -152,4 +161,6 @@ def test_half_a_condition_is_refused(embedded: VideoModel) -> None:
     with pytest.raises(ValueError, match="together with their coverage"):
         Context(text, coarse=latents())
     with pytest.raises(ValueError, match="expected body maps"):
-        transformer_input(latents(), Context(text, body=torch.zeros(2, 3, 7, 4, 4), azimuth=torch.zeros(2, 3)))
+        transformer_input(
+            latents(), Context(text, body=torch.zeros(2, 3, 7, 4, 4), azimuth=torch.zeros(2, 3)), torch.zeros(12, 17)
+        )

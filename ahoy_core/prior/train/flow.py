@@ -17,8 +17,9 @@ from ahoy_core.prior.train.loop import Row
 from ahoy_core.prior.transformer import build_transformer
 
 # Shares of the training in which a condition is there.
+_TOLD: Final = 0.2  # nothing held, no coarse latents, a caption: while colours can be had elsewhere no word is heard
 _BODY: Final = 0.92
-_COARSE: Final = 0.6
+_COARSE: Final = 0.6  # of those that are not told, here and below
 _CAPTION, _NEUTRAL = 0.5, 0.25  # the rest has no text
 _OBSERVED, _OTHER = 0.8, 0.12  # observed frames held; one other whole frame; the rest holds nothing
 _PURE_NOISE: Final = 0.3  # tau = 1 exactly: one step from there is the posterior mean, which runs use most
@@ -38,10 +39,19 @@ class Batch:
 
 
 class FlowModel(nn.Module):
-    """Transformer and text encoder, trained together; the tokenizer has no weights."""
+    """Transformer and text encoder, trained together; the tokenizer has no weights.
 
-    def __init__(self, width: int = 192, layers: int = 6) -> None:
+    Args:
+        readout: [12,17] of the autoencoder whose latents these are.
+        width: of the transformer.
+        layers: of the transformer.
+    """
+
+    readout: Tensor
+
+    def __init__(self, readout: Tensor, width: int = 192, layers: int = 6) -> None:
         super().__init__()
+        self.register_buffer("readout", readout, persistent=False)
         self.tokenizer = build_tokenizer()
         self.text_encoder = build_text_encoder(len(self.tokenizer))
         self.transformer = build_transformer(width, layers)
@@ -49,7 +59,7 @@ class FlowModel(nn.Module):
     def forward(self, latents: Tensor, tau: Tensor, batch: Batch) -> Tensor:
         """The velocity [B,C,T,h,w] at flow times tau [B]."""
         text = embed_ids(self.text_encoder, batch.ids, batch.mask)
-        stacked = transformer_input(latents, batch.context)
+        stacked = transformer_input(latents, batch.context, self.readout)
         times = timesteps(tau, latents, batch.context.held)
         return self.transformer(stacked, times, text, return_dict=False)[0]
 
@@ -61,12 +71,13 @@ def draw_batch(model: FlowModel, pool: LatentPool, size: int) -> Batch:
     drawn = pool.draw(2 * size if few else size)
     frames = drawn[0][0].pictures.shape[1]
     chosen = [_frames(rng, clips.observed[k], frames // 2 if few else frames) for clips, k in drawn]
-    use_body, use_coarse = rng.random(len(drawn)) < _BODY, rng.random(len(drawn)) < _COARSE
+    told = rng.random(len(drawn)) < _TOLD
+    use_body, use_coarse = rng.random(len(drawn)) < _BODY, (rng.random(len(drawn)) < _COARSE) & ~told
     held = [
-        _held(rng, clips, k, index, bool(use_coarse[n]))
+        _held(rng, clips, k, index, bool(use_coarse[n])) & (not told[n])
         for n, ((clips, k), index) in enumerate(zip(drawn, chosen, strict=True))
     ]
-    prompts = [_prompt(rng, clips.prompts[k]) for clips, k in drawn]
+    prompts = [clips.prompts[k] if told[n] else _prompt(rng, clips.prompts[k]) for n, (clips, k) in enumerate(drawn)]
     return make_batch(
         model, drawn, chosen, torch.stack(held), torch.from_numpy(use_body), torch.from_numpy(use_coarse), prompts
     )
@@ -141,13 +152,23 @@ class FixedValidation:
         frames = clips.pictures.shape[1]
         self.noise = torch.randn((size, LATENT_CHANNELS, frames, *clips.pictures.shape[-2:]), generator=generator)
 
-    @torch.no_grad()
     def loss(self, model: FlowModel) -> float:
         """Under the model's present weights."""
-        frames = [torch.arange(self.noise.shape[2])] * len(self.drawn)
         held = torch.stack([clips.held[k] & clips.observed[k].bool()[:, None, None] for clips, k in self.drawn])
+        return self._loss(model, held, [NEUTRAL] * len(self.drawn))
+
+    def heard(self, model: FlowModel) -> float:
+        """How much larger the loss is under other clips' captions than under the right ones, with nothing held."""
+        held = torch.zeros_like(torch.stack([clips.held[k] for clips, k in self.drawn]))
+        prompts = [clips.prompts[k] for clips, k in self.drawn]
+        wrong = [*prompts[1:], prompts[0]]
+        return self._loss(model, held, wrong) - self._loss(model, held, prompts)
+
+    @torch.no_grad()
+    def _loss(self, model: FlowModel, held: Tensor, prompts: list[str]) -> float:
+        frames = [torch.arange(self.noise.shape[2])] * len(self.drawn)
         yes = torch.ones(len(self.drawn), dtype=torch.bool)
-        batch = make_batch(model, self.drawn, frames, held, yes, ~yes, [NEUTRAL] * len(self.drawn))
+        batch = make_batch(model, self.drawn, frames, held, yes, ~yes, prompts)
         return float(flow_loss(model, batch, self.tau, self.noise))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from torch import Tensor, nn
 
 from ahoy_core.conventions import GREY
 from ahoy_core.prior.autoencoder import FrameAutoencoder
+from ahoy_core.prior.bodymaps import CELL
 from ahoy_core.prior.conditioning import FACTOR
 from ahoy_core.prior.corpus.shards import read_shard, shards
 from ahoy_core.prior.train.loop import Row
@@ -151,11 +153,26 @@ def latent_statistics(model: FrameAutoencoder, folder: Path, shards_used: int = 
 
     The background, three quarters of a picture, is one constant: it would make people look like outliers.
     """
-    latents = []
+    latents = torch.cat([found for found, _ in _people(model, folder, shards_used)])
+    return latents.mean(0).tolist(), latents.std(0).tolist()
+
+
+@torch.no_grad()
+def fitted_readout(model: FrameAutoencoder, folder: Path, shards_used: int = 4) -> list[list[float]]:
+    """[12,C+1] by least squares: a normalized latent to the mean colours of its cells, where people are."""
+    pairs = list(_people(model, folder, shards_used))
+    latents = model.normalized(torch.cat([found for found, _ in pairs])[..., None, None])[..., 0, 0]
+    known = torch.cat([latents, torch.ones(len(latents), 1)], 1)
+    solution: Tensor = torch.linalg.lstsq(known, torch.cat([colours for _, colours in pairs])).solution
+    return solution.T.tolist()
+
+
+def _people(model: FrameAutoencoder, folder: Path, shards_used: int) -> Iterator[tuple[Tensor, Tensor]]:
+    """Latents [N,C] that show some of a person, as the encoder gives them, and their cells' mean colours [N,12]."""
     for path in shards(folder, "train")[:shards_used]:
         arrays, _ = read_shard(path, ("image", "mask"))
         for clip, mask in zip(arrays["image"][::16], arrays["mask"][::16], strict=True):
-            share = nn.functional.avg_pool2d(torch.from_numpy(mask)[:, None].float() / 255, FACTOR)[:, 0]
-            latents.append(model.encode(to_model(clip)).permute(0, 2, 3, 1)[share > 0.05])
-    stacked = torch.cat(latents)
-    return stacked.mean(0).tolist(), stacked.std(0).tolist()
+            there = nn.functional.avg_pool2d(torch.from_numpy(mask)[:, None].float() / 255, FACTOR)[:, 0] > 0.05
+            pictures = to_model(clip)
+            cells = nn.functional.pixel_unshuffle(nn.functional.avg_pool2d(pictures, CELL), FACTOR // CELL)
+            yield model.encode(pictures).permute(0, 2, 3, 1)[there], cells.permute(0, 2, 3, 1)[there]
