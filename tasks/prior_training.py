@@ -148,20 +148,21 @@ def train_flow(
     """
     from ahoy_core.prior.autoencoder import FrameAutoencoder
     from ahoy_core.prior.format import save_prior
-    from ahoy_core.prior.train.flow import FixedValidation, FlowModel, train_step
-    from ahoy_core.prior.train.latents import LatentPool
+    from ahoy_core.prior.train.flow import FixedValidation, FlowModel, learns_slowly, train_step
+    from ahoy_core.prior.train.latents import LatentPool, pixel_weights
 
     torch.manual_seed(1)
     work = folder / "flow"
     work.mkdir(parents=True, exist_ok=True)
     vae = FrameAutoencoder.from_pretrained(folder / AUTOENCODER)
     model = FlowModel(vae.cell_readout, *size)
-    state = new_state(model.train(), seed=1, plain=_FLOW_VECTORS)
+    state = new_state(model.train(), seed=1, plain=_FLOW_VECTORS, slow=learns_slowly)
     if (work / _STATE).exists():
         load_state(state, work / _STATE)
     latents = folder / "latents"
     pool = LatentPool(latents, "train", seed=state.step)
     generator = torch.Generator().manual_seed(state.step)
+    channels = pixel_weights(vae, pool.some())
     held = {split: FixedValidation(LatentPool(latents, split, 0)) for split in ("people", "mesh")}
 
     def evaluate() -> Row:
@@ -173,7 +174,7 @@ def train_flow(
     run(
         state,
         schedule,
-        lambda _: train_step(model, pool, batch, generator),
+        lambda step: train_step(model, pool, batch, generator, step, channels),
         work / _STATE,
         Curve(work / _CURVE, note).add,
         evaluate,

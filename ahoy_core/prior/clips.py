@@ -65,14 +65,20 @@ class Clips:
 
 
 def load_clips(shard: Path, limit: int, turning: bool = True) -> Clips:
-    """Evenly spread clips of a shard; with `turning`, those that start in front and show the back."""
+    """Evenly spread clips of a shard; with `turning`, those that start in front and show a back without a print.
+
+    Raises:
+        ValueError: when the shard does not say who has a print on the back (its maker did not yet note it).
+    """
     names = ("image", "mask", "part", "coarse", "coverage", "body", "azimuth")
-    arrays, _ = read_shard(shard, names)
+    arrays, meta = read_shard(shard, names)
     chosen = np.arange(len(arrays["azimuth"]))
     if turning:
         front = np.abs(_wrapped(arrays["azimuth"][:, 0])) < _FRONT
         back = np.abs(_wrapped(arrays["azimuth"] - math.pi)).min(1) < _BACK
-        chosen = np.flatnonzero(front & back)
+        if "back_prints" not in meta:
+            raise ValueError(f"expected a shard that notes prints on backs, got {shard.name}; delete it, make it again")
+        chosen = np.flatnonzero(front & back & ~np.array(meta["back_prints"], dtype=bool))
     chosen = chosen[np.linspace(0, len(chosen) - 1, min(limit, len(chosen))).astype(int)]
 
     def unit(name: str) -> Tensor:

@@ -29,9 +29,9 @@ class Context:
         text: [B,S,D] embeddings.
         known: [B,C,T,h,w] clean latents, or None.
         held: [B,T,h/2,w/2] bool, tokens that keep `known` at timestep 0; None for none.
-        body: [B,T,7,2h,2w] `body_maps`, or None.
+        body: [B,T,7,2h,2w] `body_maps`, 0 for a clip whose body is not known, or None.
         azimuth: [B,T] radians; needed with `body`.
-        coarse: [B,C,T,h,w] latents of the coarse rendering, or None.
+        coarse: [B,C,T,h,w] latents of the coarse rendering, 0 for a clip that has none, or None.
         coverage: [B,T,h,w] in [0,1], observed share of the coarse rendering; needed with `coarse`.
     """
 
@@ -89,29 +89,35 @@ def transformer_input(latents: Tensor, context: Context, readout: Tensor) -> Ten
         ValueError: when a part of the context has another size.
     """
     batch, _, frames, height, width = latents.shape
-    shape = (batch, _BODY + 3, frames, height, width)
     flags = latents.new_zeros(batch, 4, frames, height, width)
     flags[:, 0] = torch.linspace(-1, 1, width, dtype=latents.dtype, device=latents.device)
     flags[:, 1] = torch.linspace(-1, 1, height, dtype=latents.dtype, device=latents.device)[:, None]
-    if context.body is None or context.azimuth is None:
-        body = latents.new_zeros(shape)
-    else:
-        if context.body.shape != (batch, frames, CHANNELS, 2 * height, 2 * width):
-            raise ValueError(
-                f"expected body maps {[batch, frames, CHANNELS, 2 * height, 2 * width]} for these latents, got "
-                f"{list(context.body.shape)}; render them at the person image's size"
-            )
-        folded = nn.functional.pixel_unshuffle(context.body.to(latents), FACTOR // CELL).transpose(1, 2)
-        turn = context.azimuth.to(latents)[:, None, :, None, None].expand(batch, 1, frames, height, width)
-        body = torch.cat([folded, turn.sin(), turn.cos(), torch.ones_like(turn)], 1)
-    coarse = torch.zeros_like(latents) if context.coarse is None else context.coarse
-    if context.coverage is not None:
-        flags[:, 2] = 1
-        flags[:, 3] = context.coverage
     told = latents.new_zeros(batch, CARRIED_CHANNELS, frames, height, width)
+    coarse = torch.zeros_like(latents)
     if context.body is not None and context.known is not None and context.held is not None:
         told = carried_colours(context.known, context.held, context.body, readout).to(latents)
-    return torch.cat([hold(latents, context), body, coarse, flags, told], 1)
+    if context.coarse is not None and context.coverage is not None:
+        given = context.coarse.flatten(1).any(1).view(-1, 1, 1, 1, 1)
+        coarse = context.coarse
+        flags[:, 2] = given[:, 0]
+        flags[:, 3] = context.coverage
+    return torch.cat([hold(latents, context), _body_channels(latents, context), coarse, flags, told], 1)
+
+
+def _body_channels(latents: Tensor, context: Context) -> Tensor:
+    """Folded body maps, azimuth and whether a clip has them, [B,_BODY + 3,T,h,w]."""
+    batch, _, frames, height, width = latents.shape
+    if context.body is None or context.azimuth is None:
+        return latents.new_zeros(batch, _BODY + 3, frames, height, width)
+    if context.body.shape != (batch, frames, CHANNELS, 2 * height, 2 * width):
+        raise ValueError(
+            f"expected body maps {[batch, frames, CHANNELS, 2 * height, 2 * width]} for these latents, got "
+            f"{list(context.body.shape)}; render them at the person image's size"
+        )
+    folded = nn.functional.pixel_unshuffle(context.body.to(latents), FACTOR // CELL).transpose(1, 2)
+    turn = context.azimuth.to(latents)[:, None, :, None, None].expand(batch, 1, frames, height, width)
+    given = context.body.flatten(1).any(1).view(-1, 1, 1, 1, 1).expand_as(turn).to(latents)
+    return torch.cat([folded, turn.sin() * given, turn.cos() * given, given], 1)
 
 
 def held_tokens(coverage: Tensor, mask: Tensor, threshold: float = 0.97) -> Tensor:

@@ -19,6 +19,7 @@ IDENTITY_PROMPT: Final = f"a {IDENTITY_TOKEN} person"
 MAX_TOKENS: Final = 24
 """Longer prompts are cut here: the corpus' longest caption has 19."""
 TEXT_WIDTH: Final = 64
+_ONE_BEFORE: Final = 1  # T5's bucket of the distance to the word before
 
 _WORDS = (
     "man", "woman", "wearing", "in", "with", "and", "of", "the", "from", "front", "back", "left", "right",
@@ -49,7 +50,32 @@ def build_text_encoder(vocabulary: int) -> Any:
     config = UMT5Config(
         vocab_size=vocabulary, d_model=TEXT_WIDTH, d_kv=16, d_ff=128, num_layers=2, num_heads=4, dropout_rate=0.0
     )
-    return UMT5EncoderModel(config)
+    encoder = UMT5EncoderModel(config)
+    _start_with_colours(encoder)
+    return encoder
+
+
+@torch.no_grad()
+def _start_with_colours(encoder: Any) -> None:
+    """Words of colours start as their colours, and one head of the first layer tells each word the one before it.
+
+    "Red top" is then a top that is red from the first step on. From random tables the way from a colour's word to a
+    garment's pixels is so long that training closes it before it carries anything.
+    """
+    tokenizer, attention = build_tokenizer(), encoder.encoder.block[0].layer[0].SelfAttention
+    for table in (encoder.shared.weight, embedding_weight(encoder)):
+        for name, rgb in COLOURS.items():
+            number = tokenizer.convert_tokens_to_ids(f"▁{name}")
+            if number < len(table):
+                table[number, :3] = 4 * (torch.tensor(rgb) - 0.5)
+    width = attention.key_value_proj_dim
+    attention.relative_attention_bias.weight[:, 0] = 0
+    attention.relative_attention_bias.weight[_ONE_BEFORE, 0] = 8
+    attention.q.weight[:width] = 0
+    attention.k.weight[:width] = 0
+    attention.v.weight[:width] = torch.eye(width, TEXT_WIDTH)
+    attention.o.weight[:, :width] = 0
+    attention.o.weight[width : 2 * width, :width] = 1.5 * torch.eye(width)
 
 
 def token_ids(tokenizer: Any, prompts: list[str], max_tokens: int = MAX_TOKENS) -> tuple[Tensor, Tensor]:

@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from ahoy_core.body.packaged import load_packaged_body
-from ahoy_core.prior.corpus import wardrobe
+from ahoy_core.prior.corpus import paint, wardrobe
+from ahoy_core.prior.corpus.dress import KINDS
 from ahoy_core.prior.corpus.makehuman import AssetError, read_garment
 from ahoy_core.prior.corpus.outfits import random_outfit
 from ahoy_core.prior.corpus.paint import garment_colour
@@ -197,3 +198,11 @@ def test_a_clip_of_a_dressed_person_fits_together(shared_dir: Path) -> None:
     again = random_clip(np.random.default_rng(9), scene)
     same = random_clip(np.random.default_rng(9), scene)
     assert np.array_equal(again.image, same.image) and np.array_equal(again.coarse, same.coarse)
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_prints_are_noted_by_their_side(side: int) -> None:
+    rows = np.zeros((len(KINDS), paint.COLUMNS), dtype=np.float32)
+    assert not paint.has_print(rows, side)
+    rows[KINDS.index("upper"), paint.PRINTS : paint.PRINTS + 2] = paint.DISC, side
+    assert paint.has_print(rows, side) and not paint.has_print(rows, -side)

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 
-from ahoy_core.prior.clips import Clips
+from ahoy_core.prior.clips import Clips, load_clips
 from ahoy_core.prior.conditioning import Context
 from ahoy_core.prior.config import IdentityConfig, InversionConfig
 from ahoy_core.prior.evaluate import held_out, inverted, repaired
@@ -22,7 +22,7 @@ from ahoy_core.prior.solvers import EVALUATIONS, Solver, SolverError
 from ahoy_core.prior.text import IDENTITY_PROMPT
 from ahoy_core.prior.video import VideoModel
 from tests.prior.test_completion import clips
-from tests.prior.test_training import write_shard
+from tests.prior.test_training import CLIPS, write_shard
 
 SOLVERS: tuple[Solver, ...] = tuple(EVALUATIONS)
 BUDGETS = (4, 9)
@@ -121,6 +121,12 @@ def test_without_a_perceptual_network_the_figures_say_so(embedded: VideoModel, t
     assert not any(name.endswith("perceptual") for name in without["repaired"])
     figures = repaired(embedded, clips(), {}, Grey())
     assert figures["coarse/perceptual"] > 0 and figures["coarse/colour torso"] > 0.3
+
+
+def test_backs_that_no_front_tells_of_are_not_asked_for(tmp_path: Path) -> None:
+    write_shard(tmp_path / "people-00000.safetensors", 0)
+    turns, everyone = (load_clips(tmp_path / "people-00000.safetensors", CLIPS, turning) for turning in (True, False))
+    assert len(everyone) == CLIPS and torch.equal(turns.frames, everyone.frames[::2])
 
 
 def subject(made: Clips) -> Subject:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -13,10 +14,19 @@ import torch
 from safetensors.numpy import save_file
 
 from ahoy_core.prior.autoencoder import FrameAutoencoder
+from ahoy_core.prior.carry import cell_colours
 from ahoy_core.prior.corpus.shards import VERSION
-from ahoy_core.prior.train import muon
-from ahoy_core.prior.train.frames import FramePool, masked_psnr, start_from_principal_components, to_model
-from ahoy_core.prior.train.latents import read_latents
+from ahoy_core.prior.text import build_text_encoder, build_tokenizer, embed_ids, token_ids
+from ahoy_core.prior.train import flow, muon
+from ahoy_core.prior.train.flow import FlowModel, draw_batch
+from ahoy_core.prior.train.frames import (
+    FramePool,
+    fitted_readout,
+    masked_psnr,
+    start_from_principal_components,
+    to_model,
+)
+from ahoy_core.prior.train.latents import LatentPool, encode_shard, pixel_weights, read_latents
 from ahoy_core.prior.train.loop import Schedule, averaged, load_state, new_state, run, save_state
 from ahoy_core.prior.video import load_video
 from tasks import prior_training
@@ -41,7 +51,13 @@ def write_shard(path: Path, seed: int) -> None:
         "azimuth": np.tile(np.arange(8, dtype=np.float32), (CLIPS, 1)),
         "observed": np.tile(np.arange(8) == 0, (CLIPS, 1)).astype(np.uint8),
     }
-    meta = {"version": VERSION, "seed": seed, "prompts": ["a person, red top"] * CLIPS, "outfits": []}
+    meta = {
+        "version": VERSION,
+        "seed": seed,
+        "prompts": ["a person, red top"] * CLIPS,
+        "back_prints": [number % 2 == 1 for number in range(CLIPS)],
+        "outfits": [],
+    }
     save_file(arrays, path, {"ahoy": json.dumps(meta)})
 
 
@@ -69,6 +85,97 @@ def test_the_recipe_makes_a_prior_and_goes_on_from_its_checkpoints(corpus: Path,
     video = load_video(tmp_path / "prior")
     frames = torch.rand(1, 3, 8, 128, 64)
     assert video.decode(video.encode(frames)).shape == frames.shape
+
+
+def test_colours_of_cells_are_read_off_latents(tmp_path: Path) -> None:
+    cells = np.random.default_rng(0).integers(0, 255, (16, 8, 32, 16, 3)).astype(np.uint8)
+    image = cells.repeat(4, 2).repeat(4, 3)  # each cell of one colour: twelve numbers a patch, fewer than a latent has
+    save_file(
+        {"image": image, "mask": np.full(image.shape[:-1], 255, np.uint8)},
+        tmp_path / "train-00000.safetensors",
+        {"ahoy": json.dumps({"version": VERSION})},
+    )
+    pictures = to_model(image.reshape(-1, *image.shape[2:]))
+    model = FrameAutoencoder()
+    start_from_principal_components(model, pictures, torch.ones_like(pictures[:, :1]))
+    model.register_to_config(latents_mean=[0.3] * 16, latents_std=[1.5] * 16)
+    model.register_to_config(cell_readout=fitted_readout(model, tmp_path))
+    with torch.no_grad():
+        read = cell_colours(model.normalized(model.encode(pictures))[:, :, None], model.cell_readout)[:, 0]
+    torch.testing.assert_close(read, pictures[:, :, ::4, ::4], rtol=0, atol=1e-3)
+
+
+def test_channels_weigh_what_they_draw(pool: LatentPool) -> None:
+    vae = FrameAutoencoder(widths=(8, 8, 8), latents_mean=[0.0] * 16, latents_std=[2.0, 1.0] * 8)
+    linear: Any = vae.decoder_skip[0]
+    with torch.no_grad():
+        linear.weight.copy_(
+            torch.linalg.qr(torch.randn(192, 16, generator=torch.Generator().manual_seed(0)))[0][..., None, None]
+        )
+    weights = pixel_weights(vae, pool.some(), frames=8)
+    # An orthonormal decoder whose every second channel is doubled: four times the energy.
+    torch.testing.assert_close(weights, torch.tensor([1.6, 0.4] * 8), rtol=0.05, atol=0)
+
+
+@pytest.fixture(scope="module")
+def pool(corpus: Path, tmp_path_factory: pytest.TempPathFactory) -> LatentPool:
+    folder = tmp_path_factory.mktemp("latents")
+    vae = FrameAutoencoder(widths=(8, 8, 8), latents_mean=[0.0] * 16, latents_std=[1.0] * 16)
+    encode_shard(vae, corpus / "train-00000.safetensors", folder)
+    return LatentPool(folder, "train", seed=0)
+
+
+def test_who_is_told_in_words_is_told_nothing_else(pool: LatentPool) -> None:
+    model = FlowModel(torch.zeros(12, 17), 24, 1)
+    told = draw_batch(model, pool, 6, told_share=1.0)
+    assert not told.context.held.any() and not told.context.coarse.any() and not told.context.coverage.any()
+    assert torch.equal(told.ids, token_ids(model.tokenizer, ["a person, red top"] * len(told.ids))[0])
+    others = draw_batch(model, pool, 6, told_share=0.0)
+    assert others.context.held.any() and others.context.coarse.any()
+    assert not torch.equal(others.ids, others.ids[:1].expand_as(others.ids))  # some hear nothing, or "a person" alone
+
+
+def test_the_first_steps_hear_words_alone(pool: LatentPool, monkeypatch: pytest.MonkeyPatch) -> None:
+    shares = []
+
+    def noted(*arguments: object) -> object:
+        shares.append(arguments[3])
+        return draw_batch(*arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(flow, "draw_batch", noted)
+    model, generator = FlowModel(torch.zeros(12, 17), 24, 1), torch.Generator().manual_seed(0)
+    for step in (0, 10_000):
+        assert torch.isfinite(flow.train_step(model, pool, 2, generator, step, torch.ones(16))[0])
+    assert shares[0] == 1 and 0 < shares[1] < 1
+
+
+@torch.no_grad()
+def test_a_garment_starts_with_the_colour_of_the_word_before_it() -> None:
+    tokenizer = build_tokenizer()
+    encoder = build_text_encoder(len(tokenizer))
+    ids, mask = token_ids(tokenizer, ["a person, red top, blue trousers", "a person, blue top, red trousers"])
+    words = embed_ids(encoder, ids, mask)
+    place = (ids[0] == tokenizer.convert_tokens_to_ids("▁top")).nonzero().item()
+    difference = (words[0] - words[1])[place]
+    # The second sixteen channels hold the word before; the first three of them its red, green and blue.
+    assert float(difference[16]) > 0.3 and float(difference[18]) < -0.3
+    elsewhere = torch.cat([difference[:16], difference[32:]]).abs().mean()
+    assert float(difference[16:19].abs().mean()) > 2 * float(elsewhere)
+
+
+def test_names_held_back_learn_at_a_share_of_the_rate(tmp_path: Path) -> None:
+    model = torch.nn.ModuleDict({"quick": torch.nn.Linear(3, 1), "slow": torch.nn.Linear(3, 1)})
+    state = new_state(model, seed=0, slow=lambda name: name.startswith("slow"))
+    before = {name: value.clone() for name, value in model.state_dict().items()}
+
+    def loss(step: int) -> tuple[torch.Tensor, dict[str, float]]:
+        # One gradient alone: Adam's steps from it are shares of the rate, whatever its size.
+        factor = 1.0 if step == 0 else 0.0
+        return factor * sum(part(torch.ones(1, 3)).square().sum() for part in model.values()), {}
+
+    run(state, Schedule(minutes=0.0005, lr=1e-2, warmup=1), loss, tmp_path / "s.safetensors", print)
+    moved = {name: float((value - before[name]).abs().mean()) for name, value in model.state_dict().items()}
+    assert moved["slow.bias"] == pytest.approx(0.3 * moved["quick.bias"], rel=1e-3) and moved["quick.bias"] > 0
 
 
 def test_latents_survive_further_training_of_the_decoder(corpus: Path, tmp_path: Path) -> None:

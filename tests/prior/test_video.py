@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -150,6 +151,21 @@ def test_every_condition_reaches_the_input(embedded: VideoModel) -> None:
     for name in ("body", "azimuth", "coarse", "coverage"):
         changed = Context(**{**full.__dict__, name: getattr(full, name) + 0.5})
         assert not torch.equal(transformer_input(latents(), changed, readout), stacked), name
+
+
+@pytest.mark.parametrize("names", [("coarse", "coverage"), ("body", "azimuth")])
+def test_a_clip_that_lacks_a_condition_looks_the_same_in_a_batch_and_alone(
+    embedded: VideoModel, names: tuple[str, str]
+) -> None:
+    """Training blanks conditions clip by clip, runs leave them out: the network must not be able to tell."""
+    full, readout = context(embedded), embedded.components.vae.cell_readout
+    parts = {name: getattr(full, name).clone() for name in names}
+    for part in parts.values():
+        part[1] = 0
+    blanked = transformer_input(latents(), replace(full, **parts), readout)
+    alone = replace(full, **dict.fromkeys(names))
+    assert torch.equal(blanked[1], transformer_input(latents(), alone, readout)[1])
+    assert torch.equal(blanked[0], transformer_input(latents(), full, readout)[0])
 
 
 def test_half_a_condition_is_refused(embedded: VideoModel) -> None:

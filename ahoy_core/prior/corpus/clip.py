@@ -17,7 +17,7 @@ from ahoy_core.conventions import GREY, PERSON_HEIGHT_SHARE, CameraModel, Camera
 from ahoy_core.prior.bodymaps import body_maps
 from ahoy_core.prior.corpus.coarse import View, coarse_frames, random_occluder
 from ahoy_core.prior.corpus.dress import KINDS, Dressed, vertex_normals
-from ahoy_core.prior.corpus.paint import random_paint
+from ahoy_core.prior.corpus.paint import has_print, random_paint
 from ahoy_core.prior.corpus.poses import ACTIONS, HELD_OUT_ACTIONS, Action, action_rotations
 from ahoy_core.prior.corpus.prompts import WEARABLES, caption
 from ahoy_core.prior.corpus.shade import Light, Surface, shade, surface
@@ -46,6 +46,7 @@ class Clip:
         azimuth: [T] float32 radians.
         observed: [T] uint8, 1 for frames that the imagined video showed.
         prompt: caption.
+        back_print: there is a print on the back, which no front tells of.
     """
 
     image: Array
@@ -57,6 +58,7 @@ class Clip:
     azimuth: Array
     observed: Array
     prompt: str
+    back_print: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,6 +125,7 @@ def random_clip(rng: np.random.Generator, scene: Scene) -> Clip:
         body=scene.body,
         azimuth=scene.azimuth,
         observed=np.isin(np.arange(FRAMES), observed).astype(np.uint8),
+        back_print=has_print(paint, side=1),
         prompt=caption({kind: found.mean(0) for kind, found in colours.items() if len(found) > 40}),
     )
 

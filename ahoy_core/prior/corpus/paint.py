@@ -54,6 +54,12 @@ def random_paint(rng: np.random.Generator, person: Dressed, chest: float) -> Arr
     return rows
 
 
+def has_print(rows: Array, side: int) -> bool:
+    """Whether the upper garment of `random_paint` has a print in front (-1) or on the back (1)."""
+    prints = rows[KINDS.index("upper"), PRINTS:].reshape(-1, PRINT_WIDTH)
+    return bool(((prints[:, 0] != NO_PRINT) & (prints[:, 1] == side)).any())
+
+
 def _pattern(rng: np.random.Generator, row: Array, kind: Kind, chest: float) -> None:
     shares = np.array(_PATTERN_SHARES)
     if kind == "lower":

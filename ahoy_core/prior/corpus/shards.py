@@ -28,6 +28,7 @@ SCENES: Final = 4  # a person: pose, cameras
 PAINTS: Final = 4  # a scene
 CLIPS: Final = PEOPLE * SCENES * PAINTS
 VERSION: Final = 1
+_NOTED: Final = ("prompt", "back_print")  # of a clip, in the metadata: what is no array
 
 
 @dataclass(frozen=True)
@@ -73,9 +74,10 @@ def make_shard(folder: Path, shard: ShardId, seed: int, body: PackagedBody, ward
     arrays = {
         field.name: np.stack([getattr(clip, field.name) for clip in clips])
         for field in fields(Clip)
-        if field.name != "prompt"
+        if field.name not in _NOTED
     }
-    meta = {"version": VERSION, "seed": seed, "prompts": [clip.prompt for clip in clips], "outfits": outfits}
+    noted = {f"{name}s": [getattr(clip, name) for clip in clips] for name in _NOTED}
+    meta = {"version": VERSION, "seed": seed, **noted, "outfits": outfits}
     with atomic_path(path) as temporary:
         save_file(arrays, temporary, {"ahoy": json.dumps(meta)})
     return path

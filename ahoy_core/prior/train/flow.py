@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import torch
@@ -17,7 +17,8 @@ from ahoy_core.prior.train.loop import Row
 from ahoy_core.prior.transformer import build_transformer
 
 # Shares of the training in which a condition is there.
-_TOLD: Final = 0.2  # nothing held, no coarse latents, a caption: while colours can be had elsewhere no word is heard
+_TOLD: Final = 0.25  # nothing held, no coarse latents, a caption: while colours can be had elsewhere no word is heard
+_TOLD_ALONE: Final = 200  # first steps, in which every clip is told
 _BODY: Final = 0.92
 _COARSE: Final = 0.6  # of those that are not told, here and below
 _CAPTION, _NEUTRAL = 0.5, 0.25  # the rest has no text
@@ -64,14 +65,14 @@ class FlowModel(nn.Module):
         return self.transformer(stacked, times, text, return_dict=False)[0]
 
 
-def draw_batch(model: FlowModel, pool: LatentPool, size: int) -> Batch:
+def draw_batch(model: FlowModel, pool: LatentPool, size: int, told_share: float = _TOLD) -> Batch:
     """A batch of training clips under random conditions; every second one or so has half of the frames."""
     rng = pool.rng
     few = rng.random() < _FEW_FRAMES
     drawn = pool.draw(2 * size if few else size)
     frames = drawn[0][0].pictures.shape[1]
     chosen = [_frames(rng, clips.observed[k], frames // 2 if few else frames) for clips, k in drawn]
-    told = rng.random(len(drawn)) < _TOLD
+    told = rng.random(len(drawn)) < told_share
     use_body, use_coarse = rng.random(len(drawn)) < _BODY, (rng.random(len(drawn)) < _COARSE) & ~told
     held = [
         _held(rng, clips, k, index, bool(use_coarse[n])) & (not told[n])
@@ -125,11 +126,21 @@ def make_batch(
     return Batch(clean, weight, context, ids, mask)
 
 
-def flow_loss(model: FlowModel, batch: Batch, tau: Tensor, noise: Tensor) -> Tensor:
-    """Weighted mean square error of the velocity (noise - clean) where nothing is held, person before background."""
+def flow_loss(model: FlowModel, batch: Batch, tau: Tensor, noise: Tensor, channels: Tensor | None = None) -> Tensor:
+    """Weighted mean square error of the velocity (noise - clean) where nothing is held, person before background.
+
+    Args:
+        model: in training.
+        batch: clips and what is known of them.
+        tau: [B] flow times.
+        noise: [B,C,T,h,w].
+        channels: [C] weights of mean 1 (`pixel_weights`); alike by default.
+    """
     level = tau.view(-1, 1, 1, 1, 1)
     velocity = model((1 - level) * batch.clean + level * noise, tau, batch)
     error = (velocity - (noise - batch.clean)).square() * batch.weight
+    if channels is not None:
+        error = error * channels.view(-1, 1, 1, 1)
     return error.sum() / (LATENT_CHANNELS * batch.weight.sum()).clamp(min=1)
 
 
@@ -144,7 +155,7 @@ class FixedValidation:
     """The loss on fixed clips, noise and times of a held-out split: observed frames held, body known, no coarse."""
 
     def __init__(self, pool: LatentPool, size: int = 24) -> None:
-        clips = next(iter(pool._clips.values()))
+        clips = pool.some()
         index = np.linspace(0, len(clips) - 1, size).astype(int)
         generator = torch.Generator().manual_seed(5)
         self.drawn = [(clips, int(k)) for k in index]
@@ -172,12 +183,18 @@ class FixedValidation:
         return float(flow_loss(model, batch, self.tau, self.noise))
 
 
-def train_step(model: FlowModel, pool: LatentPool, size: int, generator: torch.Generator) -> tuple[Tensor, Row]:
-    """The loss of one random batch."""
-    batch = draw_batch(model, pool, size)
+def train_step(
+    model: FlowModel, pool: LatentPool, size: int, generator: torch.Generator, step: int, channels: Tensor
+) -> tuple[Tensor, Row]:
+    """The loss of one random batch, its channels weighted.
+
+    The first steps hear words alone. Otherwise the attention to words is closed before it has learned anything: it
+    turns to the padding, whatever words say is noise, and no gradient comes back.
+    """
+    batch = draw_batch(model, pool, size, 1.0 if step < _TOLD_ALONE else _TOLD)
     tau = random_tau(generator, len(batch.clean))
     noise = torch.randn(batch.clean.shape, generator=generator)
-    return flow_loss(model, batch, tau, noise), {"clips": float(len(batch.clean))}
+    return flow_loss(model, batch, tau, noise, channels), {"clips": float(len(batch.clean))}
 
 
 def _frames(rng: np.random.Generator, observed: Tensor, count: int) -> Tensor:
@@ -205,6 +222,6 @@ def _prompt(rng: np.random.Generator, caption: str) -> str:
     return caption if draw < _CAPTION else NEUTRAL if draw < _CAPTION + _NEUTRAL else ""
 
 
-def state_of(model: FlowModel) -> dict[str, Any]:
-    """What a curve's first row says of the model."""
-    return {"parameters": sum(parameter.numel() for parameter in model.parameters())}
+def learns_slowly(name: str) -> bool:
+    """Text encoder and what looks at it: their gradients are small, and optimizers make full steps of any gradient."""
+    return "text" in name or ("attn2" in name and "to_out" not in name)

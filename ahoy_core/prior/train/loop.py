@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import torch
 from safetensors import safe_open
@@ -66,14 +66,33 @@ class Schedule:
     horizon: float = 250.0
 
 
-def new_state(model: nn.Module, seed: int, plain: tuple[str, ...] = ()) -> TrainState:
-    """A fresh state; names containing one of `plain` are trained by AdamW even if they are matrices."""
+_SLOW: Final = 0.3
+
+
+def new_state(
+    model: nn.Module, seed: int, plain: tuple[str, ...] = (), slow: Callable[[str], bool] = lambda _: False
+) -> TrainState:
+    """A fresh state.
+
+    Args:
+        model: to train.
+        seed: of the training.
+        plain: names containing one of these are trained by AdamW even if they are matrices.
+        slow: which names learn at `_SLOW` of the rate.
+    """
     matrices, vectors = split_parameters(model, plain)
+    names = {id(parameter): name for name, parameter in model.named_parameters()}
+
+    def groups(parameters: list[nn.Parameter]) -> list[dict[str, Any]]:
+        held_back = [p for p in parameters if slow(names[id(p)])]
+        rest = [p for p in parameters if not slow(names[id(p)])]
+        return [{"params": part, "share": share} for part, share in ((rest, 1.0), (held_back, _SLOW)) if part]
+
     average = {name: value.detach().clone() for name, value in model.state_dict().items()}
     return TrainState(
         model,
-        Muon(matrices, 1e-3),
-        torch.optim.AdamW(vectors, 1e-3, betas=(0.9, 0.97), weight_decay=0.0),
+        Muon(groups(matrices), 1e-3),
+        torch.optim.AdamW(groups(vectors), 1e-3, betas=(0.9, 0.97), weight_decay=0.0),
         average,
         seed=seed,
     )
@@ -133,7 +152,7 @@ def _set_rate(state: TrainState, schedule: Schedule, share: float) -> None:
         rate *= max(0.05, (1 - share) / schedule.cooldown)
     for optimizer in (state.matrices, state.vectors):
         for group in optimizer.param_groups:
-            group["lr"] = rate
+            group["lr"] = rate * group["share"]
 
 
 def _update(state: TrainState, value: Tensor, schedule: Schedule) -> None:

@@ -6,6 +6,7 @@ Jordan et al., "Muon: An optimizer for hidden layers in neural networks" (2024).
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -33,14 +34,18 @@ class Muon(torch.optim.Optimizer):
     """Nesterov momentum, orthogonalised; parameters of more than two axes are taken as [first, rest].
 
     Args:
-        parameters: of at least two axes.
+        parameters: of at least two axes, or groups of them.
         lr: step; the root mean square of an update's entries is about 0.2 lr, as AdamW's would be.
         momentum: of the running gradient.
         weight_decay: decoupled.
     """
 
     def __init__(
-        self, parameters: Iterable[nn.Parameter], lr: float, momentum: float = 0.95, weight_decay: float = 0.0
+        self,
+        parameters: Iterable[nn.Parameter] | Iterable[dict[str, Any]],
+        lr: float,
+        momentum: float = 0.95,
+        weight_decay: float = 0.0,
     ) -> None:
         super().__init__(parameters, {"lr": lr, "momentum": momentum, "weight_decay": weight_decay})
 
