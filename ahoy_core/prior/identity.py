@@ -17,7 +17,13 @@ from ahoy_core.formats.atomic import atomic_path
 from ahoy_core.prior.conditioning import Context
 from ahoy_core.prior.config import IdentityConfig
 from ahoy_core.prior.evidence import SEEN, Frames, holes_closed, with_mirrored
-from ahoy_core.prior.text import IDENTITY_PROMPT, IDENTITY_TOKEN, embedding_weight, identity_token_id
+from ahoy_core.prior.text import (
+    IDENTITY_PROMPT,
+    IDENTITY_TOKEN,
+    embedding_weight,
+    identity_token_id,
+    likeness_word,
+)
 from ahoy_core.prior.train.flow import random_tau
 from ahoy_core.prior.video import VideoModel
 
@@ -123,7 +129,8 @@ def train_identity(
         clean = video.encode(frames.images[:, :, None])
     size = frames.images.shape[-1] // clean.shape[-1]
     weight = (nn.functional.avg_pool2d(frames.visible, size) >= SEEN).float()[:, :, None]
-    word = _learned_word(video)
+    parts = video.components
+    word = nn.Parameter(likeness_word(parts.tokenizer, parts.text_encoder).float())
     updates = [p for network in experts(video) for p in network.parameters() if p.requires_grad]
     groups = [{"params": updates, "lr": config.lr}, {"params": [word], "lr": config.token_lr}]
     optimizer = torch.optim.AdamW(groups, betas=(0.9, 0.99), weight_decay=0.0)
@@ -141,7 +148,7 @@ def train_identity(
             losses.append(float(loss.detach()))
             progress(len(losses))
     with torch.no_grad():
-        embedding_weight(video.components.text_encoder)[identity_token_id(video.components.tokenizer)] = word
+        embedding_weight(parts.text_encoder)[identity_token_id(parts.tokenizer)] = word
     for parameter in updates:
         parameter.requires_grad_(False)
     return IdentityCurve(torch.tensor(losses))
@@ -202,12 +209,6 @@ def _identity_loss(
     velocity = video.velocity((1 - level) * clean + level * noise, tau, context)
     error = (velocity - (noise - clean)).square() * weight
     return error.sum() / (clean.shape[1] * weight.sum()).clamp(min=1)
-
-
-def _learned_word(video: VideoModel) -> nn.Parameter:
-    table = embedding_weight(video.components.text_encoder)
-    start = table[identity_token_id(video.components.tokenizer)].detach().clone().float()
-    return nn.Parameter(start)
 
 
 @contextmanager

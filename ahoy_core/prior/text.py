@@ -14,7 +14,7 @@ from ahoy_core.prior.corpus.prompts import COLOURS, NEUTRAL, WEARABLES
 IDENTITY_TOKEN: Final = "<v>"
 """[v] of the paper: the learned word for the subject; reserved in the vocabulary, trained per video."""
 LIKE: Final = "person"
-"""The word that the identity token starts as in a published tokenizer."""
+"""The word that the identity token starts as: one that no caption had would say something at random."""
 IDENTITY_PROMPT: Final = f"a {IDENTITY_TOKEN} person"
 MAX_TOKENS: Final = 24
 """Longer prompts are cut here: the corpus' longest caption has 19."""
@@ -109,6 +109,11 @@ def embedding_weight(text_encoder: Any) -> torch.nn.Parameter:
     return text_encoder.encoder.embed_tokens.weight
 
 
+def likeness_word(tokenizer: Any, text_encoder: Any) -> Tensor:
+    """The embedding [D] of `LIKE`."""
+    return embedding_weight(text_encoder)[tokenizer(LIKE, add_special_tokens=False).input_ids].detach().mean(0)
+
+
 def add_identity_token(tokenizer: Any, text_encoder: Any) -> None:
     """Give a published tokenizer the learned word of equation 2; it starts as the word `LIKE`.
 
@@ -116,11 +121,11 @@ def add_identity_token(tokenizer: Any, text_encoder: Any) -> None:
     """
     if IDENTITY_TOKEN in tokenizer.get_vocab():
         return
-    like = tokenizer(LIKE, add_special_tokens=False).input_ids
+    like = likeness_word(tokenizer, text_encoder)
     tokenizer.add_tokens([IDENTITY_TOKEN], special_tokens=True)
     if len(tokenizer) > len(embedding_weight(text_encoder)):
         text_encoder.resize_token_embeddings(len(tokenizer), mean_resizing=False)
     table = embedding_weight(text_encoder)
     with torch.no_grad():
-        table[tokenizer.convert_tokens_to_ids(IDENTITY_TOKEN)] = table[like].mean(0)
+        table[tokenizer.convert_tokens_to_ids(IDENTITY_TOKEN)] = like
     text_encoder.requires_grad_(False)

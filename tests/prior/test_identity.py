@@ -21,7 +21,7 @@ from ahoy_core.prior.identity import (
     train_identity,
     without_identity,
 )
-from ahoy_core.prior.text import IDENTITY_PROMPT
+from ahoy_core.prior.text import IDENTITY_PROMPT, embedding_weight, identity_token_id
 from ahoy_core.prior.video import VideoModel, load_video
 
 FORMS = ("embedded", "a14b", "5b")
@@ -43,6 +43,17 @@ def velocity(video: VideoModel, channels: int, tau: float) -> torch.Tensor:
     z = torch.randn(1, channels, 1, 8, 8, generator=torch.Generator().manual_seed(1))
     with torch.no_grad():
         return video.velocity(z, tau, Context(video.embed([IDENTITY_PROMPT])))
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_subject_s_word_starts_as_a_person(form: str, folders: dict[str, Path]) -> None:
+    video = load_video(folders[form])
+    parts = video.components
+    person = embedding_weight(parts.text_encoder)[parts.tokenizer("person", add_special_tokens=False).input_ids[0]]
+    expected = person.detach().clone()
+    train_identity(video, frames(), IdentityConfig(rank=1, steps=1, batch=1, token_lr=1e-9))
+    learned = embedding_weight(parts.text_encoder)[identity_token_id(parts.tokenizer)]
+    torch.testing.assert_close(learned, expected, rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("form", FORMS)
