@@ -146,7 +146,7 @@ def _roles(config: FullConfig) -> Mapping[str, Role]:
 
 AVATAR = Stage(
     "avatar",
-    3,
+    4,
     FullConfig,
     ("ingest", "perceive", "texture", "coarse"),
     run_avatar,

@@ -59,8 +59,7 @@ def run_hallucinate(config: HallucinateConfig, ctx: StageContext) -> StageOutput
         load_identity(video, ctx.inputs["identity"])
         pictures = coarse_pictures(avatar, body, sequence, video.size)
         made = repaint(video, pictures, maps, azimuth, asked, IDENTITY_PROMPT)
-    frames = composited(made, pictures)
-    supervision = as_supervision(sequence, frames, pictures)
+        supervision = as_supervision(sequence, composited(made, pictures), pictures, video.reads_bodies)
     _save(supervision, ctx.out)
     observed = torch.minimum(pictures.coverage, pictures.mask)
     figures = {
@@ -71,8 +70,9 @@ def run_hallucinate(config: HallucinateConfig, ctx: StageContext) -> StageOutput
     }
     size = {"width": supervision.cameras.width, "height": supervision.cameras.height}
     told = {"name": sequence.name, "kind": sequence.kind, "reason": sequence.reason, **size, **figures}
+    told["registered"] = supervision.registered
     (ctx.out / "sequence.json").write_text(json.dumps(told, indent=1), encoding="utf-8")
-    _draw(pictures.frames, frames, ctx.out / "before_after.png")
+    _draw(pictures.frames, supervision.frames, ctx.out / "before_after.png")
     return StageOutput(
         {"facts": _facts(figures), "notes": [sequence.reason], "figures": figures}, ("before_after.png",)
     )
@@ -129,6 +129,7 @@ def read_supervision(folder: Path) -> Supervision:
         cameras=Cameras(tensors["viewmats"], tensors["Ks"], told["width"], told["height"]),
         alphas=torch.from_numpy(arrays["alphas"]).float() / 255,
         keeps_head=True,  # the coarse avatar's own (see `composited`): nothing else shows it from behind
+        registered=told["registered"],
     )
 
 
@@ -144,7 +145,7 @@ def _roles(config: HallucinateConfig) -> Mapping[str, Role]:
 
 HALLUCINATE = Stage(
     "hallucinate",
-    3,
+    4,
     HallucinateConfig,
     ("complete", "coarse", "identity", "motions"),
     run_hallucinate,

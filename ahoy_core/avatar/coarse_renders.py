@@ -57,6 +57,7 @@ def coarse_sequences(
                 cameras=cameras,
                 alphas=shown.alphas[:, 0].clamp(0, 1),
                 keeps_head=True,
+                registered=True,
             )
         )
     return tuple(made)

@@ -44,14 +44,15 @@ class Corrections(nn.Module):
     """Corrections of F frames; zero at the start.
 
     Args:
-        frames: F.
+        registered: [F] bool of the frames: their pictures are registered, so that little is expected.
         joints: [M] joints that are corrected.
         bounds: Largest corrections.
     """
 
-    def __init__(self, frames: int, joints: Tensor, bounds: CorrectionBounds) -> None:
+    def __init__(self, registered: Tensor, joints: Tensor, bounds: CorrectionBounds) -> None:
         super().__init__()
-        self.bounds, self.joints = bounds, joints
+        self.bounds, self.joints, frames = bounds, joints, len(registered)
+        self.expected = torch.where(registered.bool(), bounds.registered, bounds.expected)[:, None]
         self.pose = nn.Parameter(torch.zeros(frames, len(joints), 3))
         self.camera = nn.Parameter(torch.zeros(frames, 6))
         self.tone = nn.Parameter(torch.zeros(frames, 6))
@@ -81,7 +82,8 @@ class Corrections(nn.Module):
     def prior(self, rows: Tensor, weights: FullWeights) -> Tensor:
         """Weighted mean squares of the corrections of frames [B], in units of their expected sizes."""
         named = ((self.pose, weights.pose_prior), (self.camera, weights.camera_prior), (self.tone, weights.tone_prior))
-        squares = [w * (torch.tanh(raw[rows]) / self.bounds.expected).square().mean() for raw, w in named]
+        expected = self.expected[rows]
+        squares = [w * (torch.tanh(raw[rows]).flatten(1) / expected).square().mean() for raw, w in named]
         return torch.stack(squares).sum()
 
     @torch.no_grad()

@@ -79,6 +79,12 @@ class CorrectionBounds(BaseModel):
     gain: float = Field(default=0.4, gt=0, description="logarithm of a colour channel's gain")
     bias: float = Field(default=0.15, gt=0, description="sRGB, of a colour channel")
     expected: float = Field(default=0.2, gt=0, le=1, description="expected size of each, as a share of its bound")
+    registered: float = Field(
+        default=0.05,
+        gt=0,
+        le=1,
+        description="the same for sequences that were rendered where they say: half a pixel of the prior's pictures",
+    )
 
 
 class FullConfig(BaseModel):

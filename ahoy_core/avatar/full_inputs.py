@@ -52,7 +52,7 @@ class Plan:
         hallucinated: Shots of each sequence.
         observed: Shots of each cluster of observed frames.
         held_out: An observed shot that is not trained on, and its number in the video.
-        corrected: Frames that have corrections.
+        registered: [F] bool of the frames that have corrections: see `Supervision`.
         notes: What was left out, and why.
     """
 
@@ -61,7 +61,7 @@ class Plan:
     hallucinated: list[list[Shot]]
     observed: list[list[Shot]]
     held_out: tuple[int, Shot] | None
-    corrected: int
+    registered: Tensor
     notes: list[str] = field(default_factory=list)
 
 
@@ -82,9 +82,10 @@ def make_plan(inputs: FullInputs, config: FullConfig) -> Plan:
         notes.append(f"no frame held out: {len(frames)} usable, more than {_MIN_FRAMES_FOR_HOLD_OUT} needed")
     sequences = () if switches.supervise == "none" else inputs.sequences
     groups, more = sequence_shots(sequences, kinematics, inputs.template, config.weights, switches.head_split)
-    corrected = sum(len(group) for group in groups)
+    known = [sequence.registered for sequence, shots in zip(sequences, groups, strict=True) for _ in shots]
+    registered = torch.tensor(known, dtype=torch.bool)
     notes += more
-    if not corrected and not frames:
+    if not len(registered) and not frames:
         raise ValueError("expected at least one usable frame or sequence, got none; see the notes of the stages before")
     sequence_poses = [axis_angle_to_matrix(sequence.map_pose.float()) for sequence in sequences]
     clusters, cluster_poses = _clusters(frames, config.observed_map_poses)
@@ -96,7 +97,7 @@ def make_plan(inputs: FullInputs, config: FullConfig) -> Plan:
         held_out = number, replace(shot, group=_nearest(shot.rotations, rotations))
     split = len(groups)
     kept = [shots for shots in numbered[:split] if shots]
-    return Plan(kinematics, rotations, kept, numbered[split:], held_out, corrected, notes)
+    return Plan(kinematics, rotations, kept, numbered[split:], held_out, registered, notes)
 
 
 def _map_poses(

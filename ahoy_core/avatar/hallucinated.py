@@ -41,6 +41,8 @@ class Supervision:
         alphas: [T,h,w] alpha of the person, or None where the generator gives none.
         keeps_head: Its head supervises, too. The paper leaves it out because a prior repaints faces badly; what was
             not repainted is all that shows the head from behind, and without it that part would be anything.
+        registered: Its pictures show the body where `pose` and `cameras` put it, because that is what they were
+            rendered or repainted from; others were found there, and may be off by more.
     """
 
     name: str
@@ -53,6 +55,7 @@ class Supervision:
     cameras: Cameras
     alphas: Tensor | None = None
     keeps_head: bool = False
+    registered: bool = False
 
     def __post_init__(self) -> None:
         count, size = len(self.frames), tuple(self.frames.shape[2:])

@@ -62,7 +62,7 @@ class Trainer:
         self.generator = torch.Generator().manual_seed(config.seed)
         pose_maps = PoseMaps(inputs.template, plan.kinematics, config.map_reduction)
         self.model = FullModel(pose_maps, config.width, config.bounds, inputs.base, self.generator)
-        self.corrections = Corrections(plan.corrected, corrected_joints(inputs.observed.body), config.corrections)
+        self.corrections = Corrections(plan.registered, corrected_joints(inputs.observed.body), config.corrections)
         self.maps = pose_maps(plan.rotations)
         self.objective = Objective(inputs, plan, config, perceptual)
         self.rates = {"network": config.learning_rate, "base": config.base_rate, "corrections": config.correction_rate}

@@ -7,9 +7,10 @@ from typing import Final
 
 import torch
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
 from ahoy_core.body.model import BodyModel
-from ahoy_core.conventions import Cameras
+from ahoy_core.conventions import GREY, Cameras
 from ahoy_core.prior.bodymaps import body_maps, camera_azimuth
 from ahoy_core.prior.conditioning import PATCH, Context, held_tokens
 from ahoy_core.prior.config import PriorConfig
@@ -19,6 +20,10 @@ from ahoy_core.prior.video import VideoModel
 
 HELD_SHARE: Final = 0.5
 """Observed share of the first frame's person from which a published model goes on from it."""
+WHOLE: Final = 0.9
+"""Alpha from which a pixel shows the person alone."""
+BESIDE: Final = 2
+"""Pixels from the edge within which the person's own colours are looked for."""
 
 
 @dataclass(frozen=True)
@@ -146,9 +151,23 @@ def _mostly_observed(pictures: Pictures) -> bool:
 def composited(generated: Tensor, pictures: Pictures) -> Tensor:
     """Generated pictures with what was observed pasted over them: a hallucination never overwrites evidence.
 
-    Nor does it invent a face: heads stay the guess's own where the pictures say where they are.
+    Nor does it invent a face: heads stay the guess's own where the pictures say where they are. And it repaints the
+    person, not the outline, which is the guess's: an autoencoder's halo beside it would make the avatar grow.
     """
+    generated = _within(generated, pictures)
     share = torch.minimum(pictures.coverage, pictures.mask)
     if pictures.heads is not None:
         share = torch.maximum(share, torch.minimum(pictures.heads, pictures.mask))
     return generated * (1 - share) + pictures.frames * share
+
+
+def _within(generated: Tensor, pictures: Pictures) -> Tensor:
+    """Generated pictures with edges of the guess's alpha over grey, coloured by the person's pixels `BESIDE` them.
+
+    Where there are none (thin fingers; the background) the guess stands.
+    """
+    whole = (pictures.mask > WHOLE).to(generated)
+    size = 2 * BESIDE + 1
+    near, colours = (avg_pool2d(v, size, stride=1, padding=BESIDE) for v in (whole, generated * whole))
+    edge = colours / near.clamp(min=1e-6) * pictures.mask + GREY * (1 - pictures.mask)
+    return torch.where(whole > 0, generated, torch.where(near > 0, edge, pictures.frames))

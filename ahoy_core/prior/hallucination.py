@@ -91,13 +91,16 @@ def rms_where(made: Tensor, truth: Tensor, weight: Tensor) -> float:
     return float((((made - truth).square() * weight).sum() / area).sqrt()) if float(area) > 0 else float("nan")
 
 
-def as_supervision(sequence: PlannedSequence, frames: Tensor, pictures: Pictures) -> Supervision:
+def as_supervision(
+    sequence: PlannedSequence, frames: Tensor, pictures: Pictures, registered: bool = True
+) -> Supervision:
     """A hallucinated sequence as the full avatar takes it, registered by the motion that rendered its coarse input.
 
     Args:
         sequence: motion pose and cameras.
         frames: [T,3,H,W] hallucinated, observed pixels and heads pasted over.
         pictures: the coarse render, for coverage and alpha.
+        registered: the prior was told where the body is; one that is not may paint it beside.
     """
     return Supervision(
         name=sequence.name,
@@ -110,4 +113,5 @@ def as_supervision(sequence: PlannedSequence, frames: Tensor, pictures: Pictures
         cameras=fine_cameras(sequence.cameras, (frames.shape[2], frames.shape[3]))[0],
         alphas=pictures.mask[:, 0],
         keeps_head=True,  # the coarse avatar's own (see `composited`): nothing else shows it from behind
+        registered=registered,
     )

@@ -13,7 +13,7 @@ BOUNDS = CorrectionBounds()
 
 
 def _corrections() -> Corrections:
-    return Corrections(1, corrected_joints(body()), BOUNDS)
+    return Corrections(torch.tensor([False]), corrected_joints(body()), BOUNDS)
 
 
 def test_corrected_joints_are_limbs_and_trunk_the_root_first():
@@ -43,6 +43,17 @@ def test_corrections_never_leave_their_bounds_and_stay_differentiable_there():
     assert torch.isfinite(gain).all() and float(bias.detach().abs().max()) <= BOUNDS.bias * (1 + 1e-3)
     (turned.sum() + moved.sum() + gain.sum() + bias.sum() + corrections.prior(ROW, FullWeights())).backward()
     assert all(torch.isfinite(p.grad).all() for p in corrections.parameters() if p.grad is not None)
+
+
+def test_a_registered_frame_pays_for_its_corrections_by_what_is_expected_of_it():
+    corrections = Corrections(torch.tensor([False, True]), corrected_joints(body()), BOUNDS)
+    for parameter in corrections.parameters():
+        parameter.data.fill_(0.1)
+    found, registered = (float(corrections.prior(torch.tensor([row]), FullWeights()).detach()) for row in (0, 1))
+    ratio = (BOUNDS.expected / BOUNDS.registered) ** 2
+    assert abs(registered / found - ratio) < 1e-4 * ratio and ratio > 10
+    both = float(corrections.prior(torch.tensor([0, 1]), FullWeights()).detach())
+    assert abs(both - (found + registered) / 2) < 1e-5 * both
 
 
 def test_turning_root_and_camera_against_each_other_leaves_the_picture():

@@ -200,7 +200,7 @@ def test_low_resolution_is_compared_after_the_same_area_filter():
 
 
 def test_tone_changes_the_person_and_leaves_what_is_behind():
-    corrections = Corrections(1, corrected_joints(body()), CorrectionBounds())
+    corrections = Corrections(torch.tensor([False]), corrected_joints(body()), CorrectionBounds())
     corrections.tone.data.fill_(1.0)
     rendered = seen(raised(0.0), around(1))
     toned = at_target_resolution(rendered, 1, corrections.tones(torch.tensor([0])))
@@ -327,7 +327,7 @@ def test_gradients_from_raw_offsets_through_skinning_to_the_picture():
     camera = torch.eye(4, dtype=torch.float64)[None]
     camera[:, 2, 3] = 3.0
     K = torch.tensor([[[12.0, 0, 4], [0, 12.0, 4], [0, 0, 1]]], dtype=torch.float64)
-    corrected = _Corrected(Corrections(1, torch.arange(3), CorrectionBounds()).double())
+    corrected = _Corrected(Corrections(torch.tensor([False]), torch.arange(3), CorrectionBounds()).double())
 
     def picture(raw: torch.Tensor, omega: torch.Tensor) -> torch.Tensor:
         still = torch.eye(3, dtype=torch.float64).expand(1, 3, 3, 3)

@@ -60,6 +60,24 @@ def test_a_head_is_never_the_priors() -> None:
     assert not torch.equal(composited(made, given)[1, :, :20], given.frames[1, :, :20])
 
 
+def test_the_outline_is_the_guesss_whatever_was_generated() -> None:
+    """Red, made with a halo, comes out within the guess's alpha over grey: edges too are red, and nothing is beside."""
+    mask = torch.zeros(1, 1, HEIGHT, WIDTH)
+    mask[..., 20:40, 10:20] = 1
+    mask[..., 20:40, 9] = 0.4
+    mask[..., 50, 25] = 0.6  # too thin to show a colour of its own
+    guess = 0.5 + 0.1 * mask.expand(-1, 3, -1, -1)
+    red = torch.tensor([1.0, 0.0, 0.0])[:, None, None]
+    made = torch.full((1, 3, HEIGHT, WIDTH), 0.5)
+    made[..., 10:60, 5:30] = 0.8 * red + 0.1
+    made[..., 20:40, 10:20] = red
+    pasted = composited(made, Pictures(guess, mask, torch.zeros_like(mask)))
+    torch.testing.assert_close(pasted[0, :, 20:40, 10:20], red.expand(-1, 20, 10))
+    torch.testing.assert_close(pasted[0, :, 20:40, 9], (0.4 * red + 0.3)[..., 0].expand(-1, 20))
+    torch.testing.assert_close(pasted[0, :, 50, 25], guess[0, :, 50, 25])
+    assert torch.equal(pasted[(mask == 0).expand_as(pasted)], torch.full((int((mask == 0).sum()) * 3,), 0.5))
+
+
 def test_the_seed_decides(embedded: VideoModel) -> None:
     maps, azimuth = body()
     one, two = (repaint(embedded, pictures(), maps, azimuth, PriorConfig(seed=seed)) for seed in (1, 2))
