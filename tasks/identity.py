@@ -140,7 +140,7 @@ def _roles(config: IdentityStageConfig) -> Mapping[str, Role]:
 
 IDENTITY = Stage(
     "identity",
-    1,
+    2,
     IdentityStageConfig,
     ("ingest", "perceive", "complete"),
     run_identity,
