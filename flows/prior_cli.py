@@ -104,6 +104,21 @@ def evaluate(
 
 
 @app.command()
+def draw(
+    prompts: Annotated[list[str], typer.Argument(help='Like "a person, red top, blue trousers".')],
+    out: Annotated[Path, typer.Option(help="PNG to write: four canonical views a prompt.")],
+    prior: Annotated[str, typer.Option(help="packaged, or a prior's folder.")] = "packaged",
+    steps: Annotated[int, typer.Option(help="1 draws the mean of what the words allow, 12 a sample.", min=1)] = 1,
+    seed: Annotated[int, typer.Option(help="Of the noise.", min=0)] = 0,
+) -> None:
+    """Draw what the prior makes of words: the average adult from front, left, back and right."""
+    from tasks.prior_drawing import draw_words
+
+    draw_words(prior, prompts, out, steps, seed)
+    console.print(str(out), highlight=False)
+
+
+@app.command()
 def card(
     folder: Annotated[Path, typer.Argument(help="Folder of the trainings.")],
     corpus_folder: Annotated[Path, typer.Option("--corpus", help="Folder of shards.")],
