@@ -158,7 +158,7 @@ def _roles(config: CompleteConfig) -> Mapping[str, Role]:
 
 COMPLETE = Stage(
     "complete",
-    5,
+    6,
     CompleteConfig,
     ("perceive", "texture"),
     run_complete,

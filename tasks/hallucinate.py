@@ -145,7 +145,7 @@ def _roles(config: HallucinateConfig) -> Mapping[str, Role]:
 
 HALLUCINATE = Stage(
     "hallucinate",
-    4,
+    5,
     HallucinateConfig,
     ("complete", "coarse", "identity", "motions"),
     run_hallucinate,

@@ -25,6 +25,9 @@ WHOLE: Final = 0.9
 BESIDE: Final = 2
 """Pixels from the edge within which the person's own colours are looked for."""
 
+MOST_GAIN: Final = 2.0
+"""More than this between two pictures of one person is no light."""
+
 
 @dataclass(frozen=True)
 class Pictures:
@@ -73,7 +76,7 @@ def repaint(
     config: PriorConfig,
     prompt: str = NEUTRAL,
 ) -> Tensor:
-    """Replaces what was not observed by what the prior finds plausible.
+    """Replaces what was not observed by what the prior finds plausible, as bright as the guess (`lit_as`).
 
     Args:
         video: the prior, with or without an identity adapter.
@@ -110,7 +113,20 @@ def repaint(
         latents = clean_up(video, noise, context, config.steps).latents
     else:
         latents = hallucinate(video, coarse, context, video.embed([NEUTRAL]), config.inversion, generator).latents
-    return video.decode(latents)[0].transpose(0, 1)
+    return lit_as(pictures, video.decode(latents)[0].transpose(0, 1))
+
+
+def lit_as(pictures: Pictures, generated: Tensor) -> Tensor:
+    """Generated pictures, each as bright over its person as the guess is.
+
+    A prior takes the light from what it is shown and sees no other: in the pictures that it learned from, light mostly
+    goes with the camera, so a back becomes as bright as the front that was observed. The guess has the light that was
+    estimated (`ahoy_core.texture.light`). One factor a picture: which garment is darker stays the prior's finding. A
+    published model, which sees the guess by RF-inversion alone, starts from its light and needs none of this.
+    """
+    wanted, found = ((v * pictures.mask).mean((1, 2, 3)) for v in (pictures.frames, generated))
+    gain = (wanted / found.clamp(min=1e-6)).clamp(1 / MOST_GAIN, MOST_GAIN).view(-1, 1, 1, 1)
+    return torch.lerp(generated, (generated * gain).clamp(0, 1), pictures.mask)
 
 
 def _repaint_unread(video: VideoModel, pictures: Pictures, config: PriorConfig, prompt: str) -> Tensor:
