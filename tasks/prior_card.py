@@ -92,8 +92,8 @@ def _model(out: Path) -> str:
     megabytes = sum(path.stat().st_size for path in out.rglob("*.safetensors")) / 2**20
     return (
         f"`WanTransformer3DModel` of width {width} and {config['num_layers']} layers with {config['in_channels']} "
-        "input channels (latents, body maps, azimuth, coarse latents, coverage); `FrameAutoencoder`, 8x down, 16 "
-        f"channels; `UMT5EncoderModel` with its own vocabulary; {megabytes:.1f} MB of weights"
+        "input channels (latents, body maps, azimuth, coarse latents, coverage, carried colours); `FrameAutoencoder`, "
+        f"8x down, 16 channels; `UMT5EncoderModel` with its own vocabulary; {megabytes:.1f} MB of weights"
     )
 
 
