@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ahoy_core.body.model import BodyModel
-from ahoy_core.conventions import GREY, canonical_cameras
-from ahoy_core.prior.completion import Pictures, pose_context, repaint
+from ahoy_core.conventions import GREY
+from ahoy_core.prior.completion import Pictures, canonical_context, repaint
 from ahoy_core.prior.config import PriorConfig
 from ahoy_core.prior.framing import HEIGHT, WIDTH
 from ahoy_core.prior.selfcheck import SelfCheck, self_check
@@ -70,10 +70,7 @@ class CanonicalFill:
         self._vertices = canonical_vertices(body, betas)
         self.points = self._texels.points(self._vertices, self._surface.faces)
         self.observed: Array = observed.coverage.ravel()[self._texels.flat] > 0
-        vertices = torch.from_numpy(self._vertices)
-        cameras = canonical_cameras(vertices, *size)
-        upright = torch.eye(3).expand(4, 3, 3)
-        self.maps, self.azimuth = pose_context(body, vertices.expand(4, -1, -1), upright, cameras)
+        self.maps, self.azimuth = canonical_context(body, torch.from_numpy(self._vertices), size)
 
     def __call__(self, kept: Tensor) -> Pictures:
         """The completed views if only the texels `kept` [N] had been observed."""

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from ahoy_core.body.model import BodyModel
-from ahoy_core.conventions import GREY, Cameras
+from ahoy_core.conventions import GREY, Cameras, canonical_cameras
 from ahoy_core.prior.bodymaps import body_maps, camera_azimuth
 from ahoy_core.prior.conditioning import PATCH, Context, held_tokens
 from ahoy_core.prior.config import PriorConfig
@@ -65,6 +65,18 @@ def pose_context(body: BodyModel, vertices: Tensor, root_rotations: Tensor, came
         cameras: T cameras.
     """
     return body_maps(body, vertices, cameras)[None], camera_azimuth(cameras.viewmats, root_rotations)[None]
+
+
+def canonical_context(body: BodyModel, vertices: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """`pose_context` of a body [V,3] in canonical pose from front, left, back and right.
+
+    Args:
+        body: that the vertices are of.
+        vertices: [V,3].
+        size: height and width of the pictures, pixels.
+    """
+    upright = torch.eye(3).expand(4, 3, 3)
+    return pose_context(body, vertices.expand(4, -1, -1), upright, canonical_cameras(vertices, *size))
 
 
 @torch.no_grad()

@@ -8,8 +8,7 @@ import torch
 from torch import Tensor
 
 from ahoy_core.body.packaged import load_packaged_body
-from ahoy_core.conventions import canonical_cameras
-from ahoy_core.prior.completion import pose_context
+from ahoy_core.prior.completion import canonical_context
 from ahoy_core.prior.conditioning import FACTOR, LATENT_CHANNELS, Context
 from ahoy_core.prior.inversion import clean_up
 from ahoy_core.prior.solvers import Solver
@@ -25,8 +24,7 @@ def bare_context(size: tuple[int, int]) -> tuple[Tensor, Tensor]:
     """
     body = load_packaged_body()
     vertices = torch.from_numpy(canonical_vertices(body, body.default_betas.numpy()))
-    cameras = canonical_cameras(vertices, *size)
-    return pose_context(body, vertices.expand(4, -1, -1), torch.eye(3).expand(4, 3, 3), cameras)
+    return canonical_context(body, vertices, size)
 
 
 @torch.no_grad()
