@@ -49,8 +49,8 @@ def run_complete(config: CompleteConfig, ctx: StageContext) -> StageOutput:
     betas = load_npz(ctx.inputs["perceive"] / "body.npz", ["betas"])["betas"]
     observed = ObservedAtlas(atlas["observed_rgb"], atlas["coverage"], atlas["source_frame"])
     video = open_prior(ctx.prior, ctx.fills)
-    settings = json.loads((ctx.inputs["texture"] / "texture.json").read_text(encoding="utf-8"))["filled_with"]
-    fill = CanonicalFill(body, betas, observed, video.size, **settings)
+    told = json.loads((ctx.inputs["texture"] / "texture.json").read_text(encoding="utf-8"))
+    fill = CanonicalFill(body, betas, observed, video.size, **told["filled_with"])
     check = check_prior(video, fill, config.seed, config.regions)
     winner = check.winner if config.believe == "winner" else _best_prior(video, check.errors)
     used = winner != BASELINE
@@ -67,6 +67,7 @@ def run_complete(config: CompleteConfig, ctx: StageContext) -> StageOutput:
         "hidden_pixels": check.pixels,
         "note": check.note,
         "prior_used": used,
+        "light": told["light"],
     }
     (ctx.out / "complete.json").write_text(json.dumps(found, indent=1), encoding="utf-8")
     return StageOutput(_summary(found), ("completed.png",) if used else ())
@@ -158,7 +159,7 @@ def _roles(config: CompleteConfig) -> Mapping[str, Role]:
 
 COMPLETE = Stage(
     "complete",
-    6,
+    7,
     CompleteConfig,
     ("perceive", "texture"),
     run_complete,

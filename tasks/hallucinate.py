@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import torch
 from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor
@@ -46,6 +48,7 @@ def run_hallucinate(config: HallucinateConfig, ctx: StageContext) -> StageOutput
         coarse_pictures,
         rms_where,
         sequence_context,
+        sequence_light,
         silhouette_iou,
     )
     from ahoy_core.prior.identity import borrowed, load_identity
@@ -58,6 +61,8 @@ def run_hallucinate(config: HallucinateConfig, ctx: StageContext) -> StageOutput
     with borrowed(open_prior(ctx.prior, ctx.fills)) as video:
         load_identity(video, ctx.inputs["identity"])
         pictures = coarse_pictures(avatar, body, sequence, video.size)
+        if video.reads_bodies and any(slope := _found(ctx.inputs["complete"])["light"]):
+            pictures = replace(pictures, light=sequence_light(body, avatar.betas, np.array(slope), sequence))
         made = repaint(video, pictures, maps, azimuth, asked, IDENTITY_PROMPT)
         supervision = as_supervision(sequence, composited(made, pictures), pictures, video.reads_bodies)
     _save(supervision, ctx.out)
@@ -81,8 +86,13 @@ def run_hallucinate(config: HallucinateConfig, ctx: StageContext) -> StageOutput
 def _asked(config: HallucinateConfig, complete: Path) -> PriorConfig:
     method: Any = config.method
     if method == "winner":
-        method = method_of(json.loads((complete / "complete.json").read_text(encoding="utf-8"))["winner"])
+        method = method_of(_found(complete)["winner"])
     return PriorConfig(method=method, steps=config.steps, inversion=config.inversion, seed=config.seed)
+
+
+def _found(complete: Path) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads((complete / "complete.json").read_text(encoding="utf-8"))
+    return found
 
 
 def _facts(figures: Mapping[str, Any]) -> dict[str, str]:
@@ -145,7 +155,7 @@ def _roles(config: HallucinateConfig) -> Mapping[str, Role]:
 
 HALLUCINATE = Stage(
     "hallucinate",
-    5,
+    6,
     HallucinateConfig,
     ("complete", "coarse", "identity", "motions"),
     run_hallucinate,

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import Final
+from collections.abc import Iterator
+from typing import Final, NamedTuple
 
 import numpy as np
 import torch
@@ -38,23 +39,63 @@ def body_maps(body: BodyModel, vertices: Tensor, cameras: Cameras) -> Tensor:
             f"expected one camera a frame and sizes divisible by {CELL}, got {len(cameras)} cameras of {size} for "
             f"{len(vertices)} frames"
         )
-    faces = body.faces.numpy().astype(np.int32)
     place = _places(body)
-    projected = cameras.project(vertices)
-    screen = torch.cat([projected.pixels, projected.depths[..., None]], -1).numpy().astype(np.float32)
     maps = np.zeros((len(vertices), CHANNELS, cameras.height, cameras.width), dtype=np.float32)
-    for t in range(len(vertices)):
-        hits = rasterize(screen[t], faces, cameras.height, cameras.width)
-        index = np.flatnonzero(hits.face >= 0)
-        corners = faces[hits.face.ravel()[index]]
-        bary = hits.bary.reshape(-1, 2)[index]
-        weights = np.concatenate([1 - bary.sum(1, keepdims=True), bary], 1)[..., None]
-        turned = (vertices[t] @ cameras.viewmats[t, :3, :3].T).numpy()[corners]
+    for t, shown in enumerate(_shown(body, vertices, cameras)):
+        turned = (vertices[t] @ cameras.viewmats[t, :3, :3].T).numpy()[shown.corners]
         normal = np.cross(turned[:, 1] - turned[:, 0], turned[:, 2] - turned[:, 0])
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
-        values = np.concatenate([np.ones((len(index), 1)), (place[corners] * weights).sum(1), normal], 1)
-        maps[t].reshape(CHANNELS, -1)[:, index] = values.T
+        values = np.concatenate([np.ones((len(normal), 1)), shown.of(place), normal], 1)
+        maps[t].reshape(CHANNELS, -1)[:, shown.pixels] = values.T
     return torch.nn.functional.avg_pool2d(torch.from_numpy(maps), CELL)
+
+
+def light_maps(body: BodyModel, vertices: Tensor, cameras: Cameras, brightness: np.ndarray) -> Tensor:
+    """How bright posed bodies are lit, one camera a frame: smooth, and going on beside the body for what is worn on it.
+
+    Args:
+        body: that the vertices are of.
+        vertices: [T,V,3] posed, world, metres.
+        cameras: T cameras, sizes as for `body_maps`.
+        brightness: [V] of the vertices, a share of their colours' own (`ahoy_core.texture.light.shading`).
+
+    Returns:
+        [T,1,H,W] float32; 1 far from the body.
+    """
+    size = (cameras.height, cameras.width)
+    drawn = np.zeros((len(vertices), 2, *size), dtype=np.float32)
+    for t, shown in enumerate(_shown(body, vertices, cameras)):
+        lit = shown.of(brightness[:, None])
+        drawn[t].reshape(2, -1)[:, shown.pixels] = np.concatenate([np.ones_like(lit), lit], 1).T
+    cells = torch.nn.functional.avg_pool2d(torch.from_numpy(drawn), CELL)
+    cover, lit = torch.nn.functional.avg_pool2d(cells, 3, stride=1, padding=1).split(1, 1)
+    smooth = torch.where(cover > 0, lit / cover.clamp(min=1e-6), torch.ones_like(lit))
+    return torch.nn.functional.interpolate(smooth, size, mode="bilinear", align_corners=False)
+
+
+class _Shown(NamedTuple):
+    """Pixels [N] of an image that show the body, and the corners [N,3] of what they show with their weights [N,3]."""
+
+    pixels: np.ndarray
+    corners: np.ndarray
+    weights: np.ndarray
+
+    def of(self, values: np.ndarray) -> np.ndarray:
+        """Values [N,K] of the pixels, of those [V,K] of the vertices."""
+        mixed: np.ndarray = (values[self.corners] * self.weights[..., None]).sum(1)
+        return mixed
+
+
+def _shown(body: BodyModel, vertices: Tensor, cameras: Cameras) -> Iterator[_Shown]:
+    faces = body.faces.numpy().astype(np.int32)
+    projected = cameras.project(vertices)
+    screens = torch.cat([projected.pixels, projected.depths[..., None]], -1).numpy().astype(np.float32)
+    for screen in screens:
+        hits = rasterize(screen, faces, cameras.height, cameras.width)
+        pixels = np.flatnonzero(hits.face >= 0)
+        bary = hits.bary.reshape(-1, 2)[pixels]
+        weights = np.concatenate([1 - bary.sum(1, keepdims=True), bary], 1)
+        yield _Shown(pixels, faces[hits.face.ravel()[pixels]], weights)
 
 
 def camera_azimuth(viewmats: Tensor, root_rotations: Tensor) -> Tensor:

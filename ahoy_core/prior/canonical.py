@@ -15,6 +15,7 @@ from ahoy_core.conventions import GREY
 from ahoy_core.prior.completion import Pictures, canonical_context, repaint
 from ahoy_core.prior.config import PriorConfig
 from ahoy_core.prior.framing import HEIGHT, WIDTH
+from ahoy_core.prior.light import light_on
 from ahoy_core.prior.selfcheck import SelfCheck, self_check
 from ahoy_core.prior.video import VideoModel
 from ahoy_core.texture.atlas import ObservedAtlas
@@ -70,10 +71,11 @@ class CanonicalFill:
         self._vertices = canonical_vertices(body, betas)
         self.points = self._texels.points(self._vertices, self._surface.faces)
         self.observed: Array = observed.coverage.ravel()[self._texels.flat] > 0
+        self._body, self._betas = body, betas
         self.maps, self.azimuth = canonical_context(body, torch.from_numpy(self._vertices), size)
 
     def __call__(self, kept: Tensor) -> Pictures:
-        """The completed views if only the texels `kept` [N] had been observed."""
+        """The completed views if only the texels `kept` [N] had been observed, and the light that those tell of."""
         size = len(self._atlas.coverage)
         known: Array = np.zeros(size * size, dtype=bool)
         known[self._texels.flat[kept.numpy()]] = True
@@ -88,7 +90,9 @@ class CanonicalFill:
         rgba = torch.from_numpy(made.views).permute(0, 3, 1, 2).float() / 255
         alpha = rgba[:, 3:]
         coverage = torch.from_numpy(made.coverage)[:, None].float() / 255
-        return Pictures(rgba[:, :3] * alpha + GREY * (1 - alpha), alpha, coverage, moving=False)
+        posed = torch.from_numpy(self._vertices).expand(4, -1, -1)
+        light = light_on(self._body, self._betas, np.array(filled.light), posed, made.cameras)
+        return Pictures(rgba[:, :3] * alpha + GREY * (1 - alpha), alpha, coverage, moving=False, light=light)
 
 
 def check_prior(video: VideoModel, fill: CanonicalFill, seed: int = 0, regions: int = 3) -> SelfCheck:

@@ -16,6 +16,7 @@ from ahoy_core.prior.conditioning import PATCH, Context, held_tokens
 from ahoy_core.prior.config import PriorConfig
 from ahoy_core.prior.corpus.prompts import NEUTRAL
 from ahoy_core.prior.inversion import clean_up, hallucinate
+from ahoy_core.prior.light import lit, unlit
 from ahoy_core.prior.video import VideoModel
 
 HELD_SHARE: Final = 0.5
@@ -24,9 +25,6 @@ WHOLE: Final = 0.9
 """Alpha from which a pixel shows the person alone."""
 BESIDE: Final = 2
 """Pixels from the edge within which the person's own colours are looked for."""
-
-MOST_GAIN: Final = 2.0
-"""More than this between two pictures of one person is no light."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +37,7 @@ class Pictures:
         coverage: [T,1,H,W] in [0,1], 1 where `frames` shows what was observed.
         moving: they follow each other as a video's frames do; views from four sides do not.
         heads: [T,1,H,W] share of a pixel that is head, where what the prior makes is not taken; None: no such place.
+        light: [T,1,H,W] brightness as a share of each colour's own (`ahoy_core.prior.light`); None: not known.
     """
 
     frames: Tensor
@@ -46,10 +45,11 @@ class Pictures:
     coverage: Tensor
     moving: bool = True
     heads: Tensor | None = None
+    light: Tensor | None = None
 
     def __post_init__(self) -> None:
         shape = (len(self.frames), 1, *self.frames.shape[2:])
-        for name in ("mask", "coverage", "heads"):
+        for name in ("mask", "coverage", "heads", "light"):
             value = getattr(self, name)
             if value is not None and value.shape != shape:
                 raise ValueError(f"expected {name} {list(shape)} for these frames, got {list(value.shape)}")
@@ -88,7 +88,12 @@ def repaint(
     config: PriorConfig,
     prompt: str = NEUTRAL,
 ) -> Tensor:
-    """Replaces what was not observed by what the prior finds plausible, as bright as the guess (`lit_as`).
+    """Replaces what was not observed by what the prior finds plausible.
+
+    The prior works on colours without the light they were seen in, and what it makes is lit where it lies. It would
+    take the light from what it is shown and sees no other: in the pictures that it learned from, light mostly goes with
+    the camera, so a back would become as bright as the front that was observed. A published model, which sees the
+    guess by RF-inversion alone, starts from its light and needs none of this.
 
     Args:
         video: the prior, with or without an identity adapter.
@@ -106,7 +111,7 @@ def repaint(
     """
     if not video.reads_bodies:
         return _repaint_unread(video, pictures, config, prompt)
-    coarse = video.encode(pictures.frames.transpose(0, 1)[None])
+    coarse = video.encode(unlit(pictures.frames, pictures.mask, pictures.light).transpose(0, 1)[None])
     coverage, mask = pictures.coverage[None, :, 0], pictures.mask[None, :, 0]
     held = held_tokens(coverage, mask) if config.hold else torch.zeros_like(held_tokens(coverage, mask))
     factor = pictures.frames.shape[-1] // coarse.shape[-1]
@@ -125,20 +130,7 @@ def repaint(
         latents = clean_up(video, noise, context, config.steps).latents
     else:
         latents = hallucinate(video, coarse, context, video.embed([NEUTRAL]), config.inversion, generator).latents
-    return lit_as(pictures, video.decode(latents)[0].transpose(0, 1))
-
-
-def lit_as(pictures: Pictures, generated: Tensor) -> Tensor:
-    """Generated pictures, each as bright over its person as the guess is.
-
-    A prior takes the light from what it is shown and sees no other: in the pictures that it learned from, light mostly
-    goes with the camera, so a back becomes as bright as the front that was observed. The guess has the light that was
-    estimated (`ahoy_core.texture.light`). One factor a picture: which garment is darker stays the prior's finding. A
-    published model, which sees the guess by RF-inversion alone, starts from its light and needs none of this.
-    """
-    wanted, found = ((v * pictures.mask).mean((1, 2, 3)) for v in (pictures.frames, generated))
-    gain = (wanted / found.clamp(min=1e-6)).clamp(1 / MOST_GAIN, MOST_GAIN).view(-1, 1, 1, 1)
-    return torch.lerp(generated, (generated * gain).clamp(0, 1), pictures.mask)
+    return lit(video.decode(latents)[0].transpose(0, 1), pictures.mask, pictures.light)
 
 
 def _repaint_unread(video: VideoModel, pictures: Pictures, config: PriorConfig, prompt: str) -> Tensor:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Any, Final
 
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from ahoy_core.avatar.avatar import Avatar
@@ -15,7 +16,10 @@ from ahoy_core.body.rotations import axis_angle_to_matrix
 from ahoy_core.conventions import GREY, Cameras
 from ahoy_core.prior.completion import Pictures, pose_context
 from ahoy_core.prior.framing import HEIGHT, WIDTH
+from ahoy_core.prior.light import light_on
 from ahoy_core.prior.sequences import PlannedSequence
+
+Array = NDArray[Any]
 
 RENDERED: Final = 2 * HEIGHT
 """Rows that a sequence is rendered with at least: small pictures are compared after the same area filter."""
@@ -68,10 +72,25 @@ def coarse_pictures(
 
 def sequence_context(body: BodyModel, betas: Tensor, sequence: PlannedSequence) -> tuple[Tensor, Tensor]:
     """Body maps [1,T,7,H/4,W/4] and azimuths [1,T] of a planned sequence of a shape `betas` [S]."""
-    count = len(sequence.pose)
-    with torch.no_grad():
-        vertices = body(sequence.pose, betas[None].expand(count, -1), sequence.transl).vertices
-    return pose_context(body, vertices, axis_angle_to_matrix(sequence.pose[:, 0]), sequence.cameras)
+    roots = axis_angle_to_matrix(sequence.pose[:, 0])
+    return pose_context(body, _vertices(body, betas, sequence), roots, sequence.cameras)
+
+
+def sequence_light(body: BodyModel, betas: Tensor, slope: Array, sequence: PlannedSequence) -> Tensor:
+    """`Pictures.light` of a planned sequence.
+
+    Args:
+        body: of the avatar.
+        betas: [S] its shape.
+        slope: [3] of the light on its texture.
+        sequence: T frames.
+    """
+    return light_on(body, betas.numpy(), slope, _vertices(body, betas, sequence), sequence.cameras)
+
+
+@torch.no_grad()
+def _vertices(body: BodyModel, betas: Tensor, sequence: PlannedSequence) -> Tensor:
+    return body(sequence.pose, betas[None].expand(len(sequence.pose), -1), sequence.transl).vertices
 
 
 def silhouette_iou(made: Tensor, pictures: Pictures) -> float:

@@ -70,11 +70,11 @@ class PriorBody:
         given = self.pictures
         # What the given front leaves open keeps the coarse fill as the prior's first guess.
         front = image * observed + given.frames[0] * (1 - observed)
-        pictures = Pictures(
-            torch.cat([front[None], given.frames[1:]]),
-            torch.cat([silhouette[None], given.mask[1:]]),
-            torch.cat([observed[None], given.coverage[1:]]),
-            moving=False,
+        pictures = replace(
+            given,
+            frames=torch.cat([front[None], given.frames[1:]]),
+            mask=torch.cat([silhouette[None], given.mask[1:]]),
+            coverage=torch.cat([observed[None], given.coverage[1:]]),
         )
         return replace(self, pictures=pictures)
 
