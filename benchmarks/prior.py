@@ -12,10 +12,13 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ahoy_core.body.packaged import PackagedBody, load_packaged_body
@@ -24,18 +27,21 @@ from ahoy_core.captures import Capture, View, read_dataset
 from ahoy_core.captures.fit import posed_vertices, read_clip, true_fit, true_frames
 from ahoy_core.conventions import Cameras
 from ahoy_core.cost import machine
+from ahoy_core.prior.bodymaps import light_maps
 from ahoy_core.prior.canonical import CanonicalFill, check_prior
 from ahoy_core.prior.config import IdentityConfig
 from ahoy_core.prior.corpus.prompts import NEUTRAL
 from ahoy_core.prior.corpus.wardrobe import SPLITS
 from ahoy_core.prior.evaluate import held_out
 from ahoy_core.prior.evidence import Frames
+from ahoy_core.prior.framing import HEIGHT, WIDTH, framing_Ks
 from ahoy_core.prior.identity_curve import Subject, generated, identity_curve
+from ahoy_core.prior.light import brightness_on, lit, unlit
 from ahoy_core.prior.scores import psnr
 from ahoy_core.prior.subject import subject_frames
 from ahoy_core.prior.video import VideoModel, load_video
 from ahoy_core.texture.atlas import ObservedAtlas
-from ahoy_core.texture.texture import TextureConfig, build_texture
+from ahoy_core.texture.texture import Texture, TextureConfig, build_texture
 from benchmarks.prior_curves import draw_curves, identity, solvers
 from tasks.fills import Fills
 from tasks.roles import perceptual_network
@@ -47,8 +53,8 @@ _PARTS = ("held-out", "captures", "solvers", "identity")
 _HELD_OUT = tuple(split for split in SPLITS if split != "train")
 
 
-def static_views(capture: Capture, body: PackagedBody) -> Frames:
-    """The four cameras of the first scored frame, whole, as person images."""
+def static_views(capture: Capture, body: PackagedBody, brightness: NDArray[Any]) -> tuple[Frames, Tensor]:
+    """The four cameras of the first scored frame, whole, as person images; and the light on them [4,1,H,W]."""
     fit, number = true_fit(capture, body), true_frames(capture)[0]
     vertices = torch.from_numpy(posed_vertices(body, fit, number))[None].expand(4, -1, -1)
     pictures = [capture.picture(View("view", name, number)) for name in _CAMERAS]
@@ -61,11 +67,26 @@ def static_views(capture: Capture, body: PackagedBody) -> Frames:
     )
     root = axis_angle_to_matrix(torch.from_numpy(fit["pose"][number, 0])).expand(4, 3, 3)
     rgb, alpha = torch.stack([one.rgb for one in pictures]), torch.stack([one.alpha for one in pictures])
-    return subject_frames(rgb, alpha[:, None], cameras, body, vertices, root)
+    Ks = framing_Ks(cameras.viewmats, vertices, HEIGHT, WIDTH, together=False)
+    framed = Cameras(cameras.viewmats, Ks, WIDTH, HEIGHT)
+    light = light_maps(body, vertices, framed, brightness)
+    return subject_frames(rgb, alpha[:, None], cameras, body, vertices, root), light
 
 
-def video_frames(capture: Capture, body: PackagedBody) -> Frames:
-    """Frames of the occluded video, evenly spread, as person images."""
+def texture_of(capture: Capture, body: PackagedBody) -> Texture:
+    """A capture's texture, from the true body."""
+    clip = read_clip(capture)
+    config = TextureConfig(atlas_size=256, frame_stride=4)
+    return build_texture(clip.frames, clip.visible, true_fit(capture, body), body, config)
+
+
+def light_of(capture: Capture, body: PackagedBody, texture: Texture) -> NDArray[Any]:
+    """Brightness [V] of the light that its video tells of."""
+    return brightness_on(body, true_fit(capture, body)["betas"], np.array(texture.notes["light"]))
+
+
+def video_frames(capture: Capture, body: PackagedBody, brightness: NDArray[Any]) -> Frames:
+    """Frames of the occluded video, evenly spread, as person images in even light."""
     fit, clip = true_fit(capture, body), read_clip(capture)
     numbers = torch.linspace(0, len(clip.frames) - 1, _IDENTITY_FRAMES).round().int().tolist()
     vertices = torch.stack([torch.from_numpy(posed_vertices(body, fit, n)) for n in numbers])
@@ -75,7 +96,7 @@ def video_frames(capture: Capture, body: PackagedBody) -> Frames:
     root = axis_angle_to_matrix(torch.from_numpy(fit["pose"][numbers, 0]))
     images = torch.from_numpy(clip.frames[numbers]).permute(0, 3, 1, 2).float() / 255
     visible = torch.from_numpy(clip.visible[numbers])[:, None].float() / 255
-    return subject_frames(images, visible, cameras, body, vertices, root)
+    return subject_frames(images, visible, cameras, body, vertices, root, brightness=brightness)
 
 
 def band_weight(views: Frames, name: str) -> Tensor:
@@ -93,26 +114,29 @@ def colours(pictures: Tensor, weight: Tensor) -> Tensor:
     return (pictures * weight).sum((0, 2, 3)) / weight.sum().clamp(min=1)
 
 
-def capture_subject(capture: Capture, body: PackagedBody) -> Subject:
+def capture_subject(capture: Capture, body: PackagedBody, texture: Texture) -> Subject:
     """A capture's person: frames of the occluded video, and the four cameras, of which only the front one is shown."""
-    views = static_views(capture, body)
+    brightness = light_of(capture, body, texture)
+    views, light = static_views(capture, body, brightness)
     garments = {name: band_weight(views, name) for name in _BANDS}
     held_back = torch.tensor([name != "front" for name in _CAMERAS])
-    return Subject(capture.name, video_frames(capture, body), views, garments, held_back)
+    return Subject(capture.name, video_frames(capture, body, brightness), views, garments, held_back, light)
 
 
 def capture_figures(video: VideoModel, capture: Capture, body: PackagedBody) -> dict[str, Any]:
     """Front to the other three cameras, and garment colours before and after the identity fine-tuning."""
-    subject = capture_subject(capture, body)
+    texture = texture_of(capture, body)
+    subject = capture_subject(capture, body, texture)
     views = subject.views
-    turned = generated(video, views, NEUTRAL, front=True)
+    even = replace(views, images=unlit(views.images, views.visible, subject.light))
+    turned = lit(generated(video, even, NEUTRAL, front=True), views.visible, subject.light)
     mirror = views.images[:1].flip(-1).expand_as(views.images)
     flat = torch.full_like(views.images, 0.5)
     for name in _BANDS:
         weight = band_weight(views, name)
         flat = torch.where(weight > 0, colours(views.images[:1], weight[:1])[:, None, None], flat)
     found: dict[str, Any] = {
-        "self_check": self_checked(video, capture, body),
+        "self_check": self_checked(video, capture, body, texture),
         "static_from_front": {},
     }
     for name in _BANDS:
@@ -125,12 +149,10 @@ def capture_figures(video: VideoModel, capture: Capture, body: PackagedBody) -> 
     return found
 
 
-def self_checked(video: VideoModel, capture: Capture, body: PackagedBody) -> dict[str, Any]:
-    """The self-check on a capture's texture, from the true body."""
-    fit, clip = true_fit(capture, body), read_clip(capture)
-    texture = build_texture(clip.frames, clip.visible, fit, body, TextureConfig(atlas_size=256, frame_stride=4))
+def self_checked(video: VideoModel, capture: Capture, body: PackagedBody, texture: Texture) -> dict[str, Any]:
+    """The self-check on a capture's texture."""
     observed = ObservedAtlas(texture.observed_rgb, texture.coverage, texture.source_frame)
-    check = check_prior(video, CanonicalFill(body, fit["betas"], observed))
+    check = check_prior(video, CanonicalFill(body, true_fit(capture, body)["betas"], observed))
     return {"errors": check.errors, "winner": check.winner, "regions": check.regions, "pixels": check.pixels}
 
 
@@ -167,7 +189,7 @@ def main() -> None:
     captures = list(read_dataset(arguments.captures, "ours"))
     body = load_packaged_body()
     if "identity" in arguments.parts:
-        people = [capture_subject(capture, body) for capture in captures]
+        people = [capture_subject(capture, body, texture_of(capture, body)) for capture in captures]
         found["identity"] = identity(video, arguments.corpus, people, arguments.people)
     if "captures" in arguments.parts:
         found["captures"] = {capture.name: capture_figures(video, capture, body) for capture in captures}

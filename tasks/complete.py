@@ -107,6 +107,12 @@ def _recolour(
     _draw(canonical["views"], views.views, ctx.out / "completed.png")
 
 
+def completed(folder: Path) -> dict[str, Any]:
+    """What this stage found, of its artifact."""
+    found: dict[str, Any] = json.loads((folder / "complete.json").read_text(encoding="utf-8"))
+    return found
+
+
 def method_of(winner: str) -> Any:
     """The method of `PriorConfig` that a competitor of the self-check stands for; the clean-up for the baseline."""
     from ahoy_core.prior.canonical import METHODS

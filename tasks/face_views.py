@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from ahoy_core.avatar.kinematics import Kinematics
 from ahoy_core.avatar.supervision import CoarseInputs
 from ahoy_core.formats.images import contact_sheet, to_uint8, write_png
 from ahoy_core.maps.template import Template
+from tasks.complete import completed
 from tasks.stage import StageContext
 
 COLUMNS = 8
@@ -88,7 +88,7 @@ def prior_filled(ctx: StageContext) -> bool:
     folder = ctx.inputs.get("complete")
     if folder is None:
         return False
-    return bool(json.loads((folder / "complete.json").read_text(encoding="utf-8"))["prior_used"])
+    return bool(completed(folder)["prior_used"])
 
 
 def draw_faces(views: FaceViews, path: Path) -> None:

@@ -20,7 +20,7 @@ from ahoy_core.conventions import Cameras
 from ahoy_core.formats.images import contact_sheet, to_float, to_uint8, write_png
 from ahoy_core.formats.npz import load_npz, save_npz
 from ahoy_core.prior.config import InversionConfig, PriorConfig
-from tasks.complete import lost, method_of
+from tasks.complete import completed, lost, method_of
 from tasks.motions import read_sequence
 from tasks.prior_folder import open_prior
 from tasks.roles import ours, packaged_body
@@ -61,7 +61,7 @@ def run_hallucinate(config: HallucinateConfig, ctx: StageContext) -> StageOutput
     with borrowed(open_prior(ctx.prior, ctx.fills)) as video:
         load_identity(video, ctx.inputs["identity"])
         pictures = coarse_pictures(avatar, body, sequence, video.size)
-        if video.reads_bodies and any(slope := _found(ctx.inputs["complete"])["light"]):
+        if video.reads_bodies and any(slope := completed(ctx.inputs["complete"])["light"]):
             pictures = replace(pictures, light=sequence_light(body, avatar.betas, np.array(slope), sequence))
         made = repaint(video, pictures, maps, azimuth, asked, IDENTITY_PROMPT)
         supervision = as_supervision(sequence, composited(made, pictures), pictures, video.reads_bodies)
@@ -86,13 +86,8 @@ def run_hallucinate(config: HallucinateConfig, ctx: StageContext) -> StageOutput
 def _asked(config: HallucinateConfig, complete: Path) -> PriorConfig:
     method: Any = config.method
     if method == "winner":
-        method = method_of(_found(complete)["winner"])
+        method = method_of(completed(complete)["winner"])
     return PriorConfig(method=method, steps=config.steps, inversion=config.inversion, seed=config.seed)
-
-
-def _found(complete: Path) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads((complete / "complete.json").read_text(encoding="utf-8"))
-    return found
 
 
 def _facts(figures: Mapping[str, Any]) -> dict[str, str]:

@@ -20,7 +20,7 @@ from ahoy_core.conventions import Cameras
 from ahoy_core.formats.images import contact_sheet, to_float, to_uint8, write_png
 from ahoy_core.formats.npz import load_npz
 from ahoy_core.prior.config import IdentityConfig
-from tasks.complete import lost
+from tasks.complete import completed, lost
 from tasks.prior_folder import open_prior
 from tasks.roles import ours, packaged_body
 from tasks.stage import Role, Stage, StageContext, StageOutput
@@ -42,7 +42,7 @@ def run_identity(config: IdentityStageConfig, ctx: StageContext) -> StageOutput:
     from ahoy_core.prior.text import IDENTITY_PROMPT
 
     with borrowed(open_prior(ctx.prior, ctx.fills)) as video:
-        frames = subject(ctx, config.frames, video.size)
+        frames = subject(ctx, config.frames, video.size, even=video.reads_bodies)
         before = drawn(video, frames, NEUTRAL, config.seed)
         losses = train_identity(video, frames, config, lambda done: ctx.progress(done, config.steps, "steps")).losses
         after = drawn(video, frames, IDENTITY_PROMPT, config.seed)
@@ -59,14 +59,16 @@ def run_identity(config: IdentityStageConfig, ctx: StageContext) -> StageOutput:
     return StageOutput({"facts": facts, "colour_errors": errors}, ("before_after.png", "losses.png"))
 
 
-def subject(ctx: StageContext, count: int, size: tuple[int, int]) -> Any:
+def subject(ctx: StageContext, count: int, size: tuple[int, int], even: bool) -> Any:
     """The subject's person images (`ahoy_core.prior.identity.Frames`).
 
     Args:
-        ctx: with the artifacts `ingest` (frames) and `perceive` (fit and masks).
+        ctx: with the artifacts `ingest` (frames), `perceive` (fit and masks) and `complete` (light).
         count: at most.
         size: height and width of the images, pixels.
+        even: without the light that the video was seen in, as `repaint` asks a prior that reads bodies.
     """
+    from ahoy_core.prior.light import brightness_on
     from ahoy_core.prior.subject import subject_frames
 
     ingest, perceive = ctx.inputs["ingest"], ctx.inputs["perceive"]
@@ -82,7 +84,9 @@ def subject(ctx: StageContext, count: int, size: tuple[int, int]) -> Any:
         fit["viewmat"].expand(number, 4, 4), fit["K"].expand(number, 3, 3), images.shape[-1], images.shape[-2]
     )
     roots = axis_angle_to_matrix(fit["pose"][rows, 0])
-    return subject_frames(images, masks[:, None], cameras, body, posed.vertices, roots, size)
+    slope = np.array(completed(ctx.inputs["complete"])["light"])
+    brightness = brightness_on(body, fit["betas"].numpy(), slope) if even and slope.any() else None
+    return subject_frames(images, masks[:, None], cameras, body, posed.vertices, roots, size, brightness)
 
 
 @torch.no_grad()
@@ -140,7 +144,7 @@ def _roles(config: IdentityStageConfig) -> Mapping[str, Role]:
 
 IDENTITY = Stage(
     "identity",
-    2,
+    3,
     IdentityStageConfig,
     ("ingest", "perceive", "complete"),
     run_identity,

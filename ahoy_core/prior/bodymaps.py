@@ -57,7 +57,7 @@ def light_maps(body: BodyModel, vertices: Tensor, cameras: Cameras, brightness: 
         body: that the vertices are of.
         vertices: [T,V,3] posed, world, metres.
         cameras: T cameras, sizes as for `body_maps`.
-        brightness: [V] of the vertices, a share of their colours' own (`ahoy_core.texture.light.shading`).
+        brightness: [V] of the vertices, a share of their colours' own (`ahoy_core.prior.light.brightness_on`).
 
     Returns:
         [T,1,H,W] float32; 1 far from the body.

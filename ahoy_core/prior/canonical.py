@@ -12,10 +12,11 @@ from torch import Tensor
 
 from ahoy_core.body.model import BodyModel
 from ahoy_core.conventions import GREY
+from ahoy_core.prior.bodymaps import light_maps
 from ahoy_core.prior.completion import Pictures, canonical_context, repaint
 from ahoy_core.prior.config import PriorConfig
 from ahoy_core.prior.framing import HEIGHT, WIDTH
-from ahoy_core.prior.light import light_on
+from ahoy_core.prior.light import brightness_on
 from ahoy_core.prior.selfcheck import SelfCheck, self_check
 from ahoy_core.prior.video import VideoModel
 from ahoy_core.texture.atlas import ObservedAtlas
@@ -91,7 +92,8 @@ class CanonicalFill:
         alpha = rgba[:, 3:]
         coverage = torch.from_numpy(made.coverage)[:, None].float() / 255
         posed = torch.from_numpy(self._vertices).expand(4, -1, -1)
-        light = light_on(self._body, self._betas, np.array(filled.light), posed, made.cameras)
+        brightness = brightness_on(self._body, self._betas, np.array(filled.light))
+        light = light_maps(self._body, posed, made.cameras, brightness)
         return Pictures(rgba[:, :3] * alpha + GREY * (1 - alpha), alpha, coverage, moving=False, light=light)
 
 

@@ -14,9 +14,10 @@ from ahoy_core.avatar.render import render
 from ahoy_core.body.model import BodyModel
 from ahoy_core.body.rotations import axis_angle_to_matrix
 from ahoy_core.conventions import GREY, Cameras
+from ahoy_core.prior.bodymaps import light_maps
 from ahoy_core.prior.completion import Pictures, pose_context
 from ahoy_core.prior.framing import HEIGHT, WIDTH
-from ahoy_core.prior.light import light_on
+from ahoy_core.prior.light import brightness_on
 from ahoy_core.prior.sequences import PlannedSequence
 
 Array = NDArray[Any]
@@ -85,7 +86,8 @@ def sequence_light(body: BodyModel, betas: Tensor, slope: Array, sequence: Plann
         slope: [3] of the light on its texture.
         sequence: T frames.
     """
-    return light_on(body, betas.numpy(), slope, _vertices(body, betas, sequence), sequence.cameras)
+    brightness = brightness_on(body, betas.numpy(), slope)
+    return light_maps(body, _vertices(body, betas, sequence), sequence.cameras, brightness)
 
 
 @torch.no_grad()

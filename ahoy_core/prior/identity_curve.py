@@ -18,6 +18,7 @@ from ahoy_core.prior.corpus.prompts import NEUTRAL
 from ahoy_core.prior.evidence import Frames
 from ahoy_core.prior.identity import borrowed, train_identity
 from ahoy_core.prior.inversion import clean_up
+from ahoy_core.prior.light import lit
 from ahoy_core.prior.scores import colour_distance, psnr
 from ahoy_core.prior.text import IDENTITY_PROMPT
 from ahoy_core.prior.video import VideoModel
@@ -36,6 +37,7 @@ class Subject:
         views: T whole person images with bodies and azimuths.
         garments: name -> [T,1,H,W] alpha of it in `views`.
         held_back: [T] bool, views from sides that `seen` does not show.
+        light: [T,1,H,W] on `views`, which `seen` is without (`ahoy_core.prior.light`); None: `seen` is as lit as they.
     """
 
     name: str
@@ -43,6 +45,7 @@ class Subject:
     views: Frames
     garments: Mapping[str, Tensor]
     held_back: Tensor
+    light: Tensor | None = None
 
 
 def corpus_subjects(clips: Clips, split: str) -> list[Subject]:
@@ -85,7 +88,7 @@ def likeness(made: Tensor, subject: Subject) -> dict[str, float]:
     """How like a subject the generated views are.
 
     Args:
-        made: [T,3,H,W].
+        made: [T,3,H,W], in the light of `seen`.
         subject: whose views.
 
     Returns:
@@ -93,6 +96,7 @@ def likeness(made: Tensor, subject: Subject) -> dict[str, float]:
         `psnr_held_back` in dB over the person in the views that were held back.
     """
     views, found = subject.views, {}
+    made = lit(made, views.visible, subject.light)
     for name, weight in subject.garments.items():
         for key, apart in (("colour_distance", False), ("light_apart", True)):
             found[f"{key}/{name}"] = float(colour_distance(made, views.images, weight, apart))

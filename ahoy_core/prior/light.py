@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ahoy_core.body.model import BodyModel
-from ahoy_core.conventions import GREY, Cameras
-from ahoy_core.prior.bodymaps import light_maps
+from ahoy_core.conventions import GREY
 from ahoy_core.texture.light import shading
 from ahoy_core.texture.surface import Surface
 from ahoy_core.texture.texture import canonical_vertices
@@ -22,18 +21,15 @@ from ahoy_core.texture.tones import vertex_normals
 Array = NDArray[Any]
 
 
-def light_on(body: BodyModel, betas: Array, slope: Array, vertices: Tensor, cameras: Cameras) -> Tensor:
-    """Brightness [T,1,H,W] of posed bodies as a share of each colour's own, by the light that they carry about.
+def brightness_on(body: BodyModel, betas: Array, slope: Array) -> Array:
+    """Brightness [V] of a body's vertices as a share of each colour's own, whatever its pose.
 
     Args:
-        body: that the vertices are of.
+        body: of V vertices.
         betas: [S] its shape.
         slope: [3] of brightness over the canonical normal, see `ahoy_core.texture.light.estimate_light`.
-        vertices: [T,V,3] posed, world, metres.
-        cameras: T cameras.
     """
-    normals = vertex_normals(Surface.of(body), canonical_vertices(body, betas))
-    return light_maps(body, vertices, cameras, shading(normals, slope))
+    return shading(vertex_normals(Surface.of(body), canonical_vertices(body, betas)), slope)
 
 
 def unlit(frames: Tensor, mask: Tensor, light: Tensor | None) -> Tensor:
@@ -42,7 +38,7 @@ def unlit(frames: Tensor, mask: Tensor, light: Tensor | None) -> Tensor:
     Args:
         frames: [T,3,H,W] in [0,1] over grey.
         mask: [T,1,H,W] alpha of the person.
-        light: [T,1,H,W] of `light_on`; None: not known, and left.
+        light: [T,1,H,W] of `ahoy_core.prior.bodymaps.light_maps`; None: not known, and left.
     """
     return frames if light is None else _times(frames, mask, 1 / light)
 
