@@ -30,6 +30,7 @@ from tasks.cost.errors import whole_errors
 from tasks.cost.predict import ingested, work_knobs
 from tasks.cost.rows import Rows
 from tasks.cost.truth import TruthConfig, truth_stage
+from tasks.prior_folder import no_prior, prior_role
 from tasks.running import resolve_inputs, run_stage
 from tasks.settings import Settings
 from tasks.stage import Observer, Run, Source, Stage, StageContext, StageRef
@@ -176,7 +177,8 @@ def whole_rows(base: Base, settings: Mapping[str, EvaluateRequest], rows: Rows, 
         subject = replace(base, request=request).subject
         chosen = subject.settings("full")
         versions = {stage.name: stage.version for stage in STAGES}
-        made_of = _hash([chosen.model_dump(mode="json"), versions, subject.truth.content_hash, request.size])
+        asked = _prior(subject.run())
+        made_of = _hash([chosen.model_dump(mode="json"), versions, asked, subject.truth.content_hash, request.size])
         knob, _, value = said.partition("=")
         if rows.reuse(made_of, f"end-to-end.{knob}", {knob: _plain(value)}):
             continue
@@ -186,6 +188,11 @@ def whole_rows(base: Base, settings: Mapping[str, EvaluateRequest], rows: Rows, 
             rows.add(_whole(row, subject))
         except Exception as problem:  # a run that fails is a finding about that setting
             rows.add(replace(row, failed=f"{type(problem).__name__}: {problem}"))
+
+
+def _prior(run: Run) -> str:
+    """The prior's contents, or why there is none: retrained weights make another run."""
+    return no_prior(run.prior, run.body, run.fills) or prior_role(run.prior).weights_sha256
 
 
 def _whole(row: Measurement, subject: Subject) -> Measurement:

@@ -16,6 +16,8 @@ from ahoy_core.captures.fit import read_clip, true_fit
 from ahoy_core.captures.texture_errors import texture_errors
 from ahoy_core.formats.npz import load_npz
 from tasks.evaluation.scoring import score_avatar
+from tasks.fills import Fills
+from tasks.roles import perceptual_network
 
 FolderErrors = Callable[[Capture, Mapping[str, Path], Path], Mapping[str, float]]
 """Errors (smaller is better) of a stage's output folder, given the capture and the folders of its inputs."""
@@ -49,15 +51,22 @@ def whole_errors(avatar: Avatar, capture: Capture, size: int) -> Mapping[str, fl
     """Root mean square errors, of 255, of an avatar driven by the true body, before cameras that are not the input's.
 
     `rmse` stands for the mean PSNR of novel views and novel poses, which `view_rmse` and `pose_rmse` give apart.
+    Blur is cheap in it; `ssim_loss` (1 - SSIM) and `perceptual` (of the network that fills the role, where one does)
+    say what sharpness is worth.
     """
     views, poses = ([v for v in capture.of(m) if v.camera != capture.input_camera] for m in ("view", "pose"))
-    view, pose = (score_avatar(avatar, load_packaged_body(), capture, some, size) for some in (views, poses))
-    return {
+    network, body = perceptual_network(Fills()), load_packaged_body()
+    view, pose = (score_avatar(avatar, body, capture, some, size, perceptual=network) for some in (views, poses))
+    found = {
         "rmse": rmse((view.psnr + pose.psnr) / 2),
         "view_rmse": rmse(view.psnr),
         "pose_rmse": rmse(pose.psnr),
         "head_rmse": rmse(view.psnr_head),
+        "ssim_loss": 1 - (view.ssim + pose.ssim) / 2,
     }
+    if view.perceptual is not None and pose.perceptual is not None:
+        found["perceptual"] = (view.perceptual + pose.perceptual) / 2
+    return found
 
 
 def rmse(psnr: float) -> float:

@@ -26,6 +26,12 @@ better in the first error. Error is drawn over time, both logarithmic. What is s
 `tasks/cost/declared.py`. Machine: {machine}.
 """
 
+_FRONTS = {"PSNR": "rmse", "perceptual": "perceptual"}
+_WHOLE_WORDS = (
+    "The columns of stages are their CPU seconds; SSIM and perceptual distance (less is better) are means of novel "
+    "views and novel poses. The last column says in which figures no other row is both cheaper and better."
+)
+
 
 def write_page(rows: Sequence[Measurement], facts: Mapping[str, Any], page: Path) -> list[Path]:
     """Write the page and the diagrams beside it.
@@ -84,18 +90,21 @@ def _table(rows: Sequence[Measurement], error: str) -> str:
 def _whole_table(rows: Sequence[Measurement]) -> str:
     if not rows:
         return "Not measured yet."
-    front = {id(row) for row in pareto(rows, "rmse")}
+    fronts = {word: {id(row) for row in pareto(rows, error)} for word, error in _FRONTS.items()}
     stages = [name for name in rows[0].parts if any(row.parts.get(name, 0) >= 0.5 for row in rows)]
-    head = ["setting", "value", "CPU minutes", "PSNR, dB", "novel view", "novel pose", "head", "MB", *stages, ""]
+    words = ["PSNR, dB", "novel view", "novel pose", "head", "SSIM", "perceptual"]
+    head = ["setting", "value", "CPU minutes", *words, "MB", *stages, "Pareto"]
     lines = [_line(head), _line(["---"] * len(head))]
     for row in rows:
         scores = [f"{psnr(row.errors[name]):.2f}" for name in ("rmse", "view_rmse", "pose_rmse", "head_rmse")]
+        scores.append(f"{1 - row.errors['ssim_loss']:.3f}" if "ssim_loss" in row.errors else "-")
+        scores.append(_figure(row.errors.get("perceptual")))
         minutes = f"{row.cpu_s.median / 60:.2f}" if row.cpu_s else "-"
-        mark = "Pareto" if id(row) in front else ""
+        mark = ", ".join(word for word, front in fronts.items() if id(row) in front)
         seconds = [f"{row.parts.get(name, 0.0):.1f}" for name in stages]
         cells = [row.sweep.partition(".")[2], shown(row.setting), minutes, *scores, _whole(row.peak_mb), *seconds]
         lines.append(_line([*cells, mark]))
-    lines += ["", "The columns of stages are their CPU seconds."]
+    lines += ["", _WHOLE_WORDS]
     return "\n".join(lines)
 
 

@@ -15,6 +15,7 @@ from ahoy_core.avatar.avatar import Avatar
 from ahoy_core.body.model import BodyModel
 from ahoy_core.captures.capture import Capture, View
 from ahoy_core.formats.images import contact_sheet, to_uint8, write_png
+from ahoy_core.metrics.perceptual import Perceptual
 from ahoy_core.metrics.protocol import PROTOCOLS
 from ahoy_core.metrics.regions import mask_box
 from ahoy_core.metrics.score import Score, score_picture
@@ -27,17 +28,27 @@ _MARGIN = 6  # pixels shown round the person
 
 @dataclass(frozen=True)
 class AvatarScores:
-    """Means over pictures: PSNR in dB of the person's box and of the head's (NaN where none is seen), SSIM, IoU."""
+    """Means over pictures: PSNR in dB of the person's box and of the head's (NaN where none is seen), SSIM, IoU.
+
+    `perceptual` is the mean distance of the boxes by the network that was asked, None without one.
+    """
 
     psnr: float
     psnr_head: float
     ssim: float
     iou: float
     pictures: int
+    perceptual: float | None = None
 
 
 def score_avatar(
-    avatar: Avatar, body: BodyModel, capture: Capture, views: Sequence[View], size: int = 256, sheet: Path | None = None
+    avatar: Avatar,
+    body: BodyModel,
+    capture: Capture,
+    views: Sequence[View],
+    size: int = 256,
+    sheet: Path | None = None,
+    perceptual: Perceptual | None = None,
 ) -> AvatarScores:
     """Render and score an avatar at true pictures of a capture.
 
@@ -48,6 +59,7 @@ def score_avatar(
         views: of the moments "view" and "pose", of any camera.
         size: longest side of what is compared, pixels.
         sheet: where to put a picture of truths and renders, if anywhere.
+        perceptual: network that compares the boxes, if any.
 
     Raises:
         ValueError: no true picture shows anybody.
@@ -60,12 +72,15 @@ def score_avatar(
         if (shot := truths.shot(protocol, view)) is None:
             continue
         made = renderer(shot)
-        found.append({score.region: score for score in score_picture(made, shot.truth, PROTOCOLS[protocol].pixels)})
+        scores = score_picture(made, shot.truth, PROTOCOLS[protocol].pixels, perceptual)
+        found.append({score.region: score for score in scores})
         pictures += [_cut(shot, None), _cut(shot, to_uint8(made.rgb))]
     if not found:
         raise ValueError(f"expected true pictures of {capture.name} that show somebody, got none of {len(views)}")
     if sheet is not None:
         write_png(sheet, contact_sheet(pictures, columns=8, cell=256))
+    distances = [one["box"].perceptual for one in found if "box" in one]
+    known = [distance for distance in distances if distance is not None]
     boxes, heads = ([one[name] for one in found if name in one] for name in ("box", "head"))
     return AvatarScores(
         float(np.mean([score.psnr for score in boxes])),
@@ -73,6 +88,7 @@ def score_avatar(
         float(np.mean([score.ssim for score in boxes if score.ssim is not None])),
         float(np.mean([score.iou for score in boxes if score.iou is not None])),
         len(found),
+        float(np.mean(known)) if known else None,
     )
 
 
