@@ -18,7 +18,8 @@ from tasks.motions import read_sequence
 from tests.e2e.conftest import SmallRun
 from tests.prior.conftest import embedded_folder  # noqa: F401  (a session fixture)
 
-BELIEVED = ("complete.believe=prior", "complete.regions=1", "identity.steps=2", "identity.frames=2", "motions.limit=2")
+SHORT = ("complete.regions=1", "identity.steps=2", "identity.frames=2", "motions.limit=2")
+BELIEVED = ("complete.believe=prior", *SHORT)
 
 
 def _latest(run: SmallRun) -> list[dict[str, Any]]:
@@ -44,7 +45,7 @@ def test_without_a_prior_its_stages_are_skipped_with_the_reason(small_run: Small
 
 
 def test_the_packaged_prior_is_asked_where_a_run_says_nothing_else(small_run: SmallRun) -> None:
-    small_run.again(knobs=["prior=packaged", "complete.regions=1"])
+    small_run.again(knobs=["prior=packaged", *SHORT])
     complete = next(row for row in _latest(small_run) if row["stage"] == "complete")
     manifest, folder = _manifest(small_run, complete)
     assert "embedded prior" in manifest.roles["video"]["name"]
@@ -55,7 +56,7 @@ def test_the_packaged_prior_is_asked_where_a_run_says_nothing_else(small_run: Sm
 def test_a_prior_that_loses_its_self_check_changes_nothing(small_run: SmallRun, embedded_folder: Path) -> None:  # noqa: F811
     small_run.again(knobs=["prior=none"])
     before = {row["stage"]: row["key"] for row in _latest(small_run)}
-    output = small_run.again(knobs=[f"prior={embedded_folder}", "complete.regions=1"]).output
+    output = small_run.again(knobs=[f"prior={embedded_folder}", *SHORT]).output
     rows = {row["stage"]: row for row in _latest(small_run)}
     assert "did not win this video's self-check" in rows["identity"]["reason"], output
     manifest, folder = _manifest(small_run, rows["complete"])
