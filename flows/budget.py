@@ -106,8 +106,8 @@ def _said(choice: Choice, measured: MeasuredSet, predictor: Predictor, budget_s:
     if row is not None:
         known = psnr(row.errors["rmse"])
         lines.append(
-            f"predicted {known + choice.gain:.2f} dB on the captures that were measured, {choice.gain:+.2f} against "
-            f"preset {measured.preset} ({known:.2f} dB, {(row.cpu_s.median if row.cpu_s else 0) / 60:.1f} CPU minutes)"
+            f"predicted gain on the captures that were measured: {choice.gain:+.2f} dB, sharpness counted, over preset "
+            f"{measured.preset} ({known:.2f} dB, {(row.cpu_s.median if row.cpu_s else 0) / 60:.1f} CPU minutes)"
         )
     if not choice.fits:
         lines.append("that is over the budget: nothing that was measured is cheaper")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
@@ -18,6 +19,10 @@ from ahoy_core.formats.npz import load_npz
 from tasks.evaluation.scoring import score_avatar
 from tasks.fills import Fills
 from tasks.roles import perceptual_network
+
+SHARPNESS_DB: Final = 20.0
+"""Decibels that one unit of perceptual distance is worth: a hundredth counts as 0.2 dB. Without it no knob would ever
+be worth its time: where a fit is a pixel off, blur has the better PSNR."""
 
 FolderErrors = Callable[[Capture, Mapping[str, Path], Path], Mapping[str, float]]
 """Errors (smaller is better) of a stage's output folder, given the capture and the folders of its inputs."""
@@ -72,6 +77,19 @@ def whole_errors(avatar: Avatar, capture: Capture, size: int) -> Mapping[str, fl
 def rmse(psnr: float) -> float:
     """Levels of 255 that a PSNR in dB (peak 1) stands for."""
     return float(255 * 10 ** (-psnr / 20))
+
+
+def gain(errors: Mapping[str, float], base: Mapping[str, float]) -> float:
+    """How much more accurate a whole run is than another: dB of PSNR, and `SHARPNESS_DB` where both were compared so.
+
+    Args:
+        errors: of `whole_errors`.
+        base: likewise, of the other.
+    """
+    found = psnr(errors["rmse"]) - psnr(base["rmse"])
+    if "perceptual" in errors and "perceptual" in base:
+        found += SHARPNESS_DB * (base["perceptual"] - errors["perceptual"])
+    return found
 
 
 def psnr(levels: float) -> float:

@@ -14,7 +14,7 @@ from typing import Any
 from ahoy_core.cost.sweep import Measurement, row_of
 from ahoy_core.cost.work import Knobs, TimeModel, fit_times
 from tasks.cost.declared import END_TO_END
-from tasks.cost.errors import psnr
+from tasks.cost.errors import gain, psnr
 from tasks.cost.summary import of_sweep, over_captures
 from tasks.presets import PRESETS
 from tasks.settings import Preset
@@ -55,19 +55,18 @@ class MeasuredSet:
         return next((row for row in self.whole if dict(row.setting) == {knob: value}), None)
 
     def gains(self) -> dict[str, dict[Any, float]]:
-        """Knob -> value -> PSNR in dB that it gains over the base, everything else alike.
+        """Knob -> value -> dB that it gains over the base (`tasks.cost.errors.gain`), everything else alike.
 
         The base's own row is the preset's, measured without overrides or not at all.
         """
         base = self.whole_row("preset", self.preset)
         if base is None:
             return {}
-        known = psnr(base.errors["rmse"])
         found: dict[str, dict[Any, float]] = {}
         for row in self.whole:
             (knob, value), *_ = row.setting.items()
             if knob != "preset":
-                found.setdefault(knob, {})[value] = psnr(row.errors["rmse"]) - known
+                found.setdefault(knob, {})[value] = gain(row.errors, base.errors)
         return found
 
 
@@ -87,7 +86,9 @@ def cited(preset: str, measured: MeasuredSet) -> str:
     if row is None or row.cpu_s is None:
         return f"preset {preset}: no whole run of it has been measured yet (docs/cost.md, omissions)"
     known = psnr(row.errors["rmse"])
-    return f"preset {preset}: {row.cpu_s.median / 60:.1f} CPU minutes, {known:.2f} dB on {row.capture} (docs/cost.md)"
+    sharp = f", perceptual distance {row.errors['perceptual']:.3f}" if "perceptual" in row.errors else ""
+    minutes = row.cpu_s.median / 60
+    return f"preset {preset}: {minutes:.1f} CPU minutes, {known:.2f} dB{sharp} on {row.capture} (docs/cost.md)"
 
 
 def write_measured(path: Path, rows: Sequence[Measurement], facts: Mapping[str, Any]) -> None:

@@ -18,7 +18,7 @@ from tasks.cost.measured import MeasuredSet
 from tasks.presets import PRESETS
 from tasks.settings import Settings
 
-LEAST_GAIN_DB = 0.05  # smaller differences of PSNR between single runs are noise
+LEAST_GAIN_DB = 0.05  # smaller differences between single runs are noise
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ class Predictor:
 
 
 def gains_of(measured: MeasuredSet, fixed: Sequence[str] = ()) -> Gains:
-    """What single knobs gain over the set's base, in dB of PSNR; those that are fixed are left out."""
+    """What single knobs gain over the set's base, in dB, sharpness counted; those that are fixed are left out."""
     settings = PRESETS[measured.preset].with_overrides(measured.overrides).model_dump(mode="json")
     by_knob, base = {}, {}
     for knob, values in measured.gains().items():

@@ -17,8 +17,9 @@ from ahoy_core.cost.choose import Gains, alternatives, choose, worth_telling
 from ahoy_core.cost.pace import measure_pace
 from ahoy_core.cost.work import FRAMES, KNOBS, PIXELS, WORK, fit_times
 from tasks.cost.declared import STAGE_SWEEPS
-from tasks.cost.errors import psnr, rmse
+from tasks.cost.errors import SHARPNESS_DB, gain, psnr, rmse
 from tasks.cost.measured import read_measured, write_measured
+from tasks.cost.page import write_page
 from tasks.cost.predict import Clip, Predictor, gains_of, work_knobs
 from tasks.cost.rows import Rows
 from tasks.cost.summary import omissions, over_captures
@@ -147,6 +148,32 @@ def test_the_measured_set_survives_its_file_and_gives_gains_over_its_base(tmp_pa
     assert not gains_of(found, fixed=["avatar.steps"]).by_knob
     with pytest.raises(ValueError, match="version"):
         read_measured('{"schema_version": 99}')
+
+
+def test_sharpness_is_bought_where_it_was_measured_on_both_sides_and_blur_is_not() -> None:
+    base, sharp, blurred = (
+        {"rmse": rmse(db), "perceptual": distance} for db, distance in ((21.0, 0.17), (20.9, 0.16), (21.1, 0.2))
+    )
+    assert gain(sharp, base) == pytest.approx(SHARPNESS_DB * 0.01 - 0.1) and gain(sharp, base) > 0 > gain(blurred, base)
+    assert gain({"rmse": rmse(20.9)}, base) == pytest.approx(-0.1) == pytest.approx(gain(sharp, {"rmse": rmse(21.0)}))
+
+
+def test_both_fronts_of_whole_runs_are_marked(tmp_path: Path) -> None:
+    rows = []
+    for name, db, seconds, distance in (
+        ("draft", 21, 60, 0.17),
+        ("standard", 20.9, 200, 0.16),
+        ("high", 20.8, 300, 0.165),
+    ):
+        levels = {f"{kind}rmse": rmse(db) for kind in ("", "view_", "pose_", "head_")}
+        errors = {**levels, "ssim_loss": 0.3, "perceptual": distance}
+        rows.append(replace(_whole("preset", name, db, seconds), errors=errors))
+    write_page(rows, {"base": "preset draft", "machine": "this"}, tmp_path / "cost.md")
+    cells = [
+        line.split(" | ") for line in (tmp_path / "cost.md").read_text().splitlines() if line.startswith("| preset")
+    ]
+    marks = {row[1]: row[-1].removesuffix("|").strip() for row in cells}
+    assert marks == {"draft": "PSNR, perceptual", "standard": "perceptual", "high": ""}
 
 
 def test_a_prediction_knows_the_video_and_scales_with_the_machine(tmp_path: Path) -> None:
