@@ -15,7 +15,7 @@ class CoarseConfig(BaseModel):
 
     map_size: int = Field(default=256, ge=16, description="side of the canonical maps, a power of two: sets N")
     width: int = Field(default=16, ge=4, description="channels of the StyleUNet at its finest resolution")
-    steps: int = Field(default=100, ge=1, description="optimiser steps")
+    steps: int = Field(default=60, ge=1, description="optimiser steps")
     views_per_step: int = Field(default=2, ge=1, description="canonical views per network pass")
     frames_per_step: int = Field(default=3, ge=1, description="observed frames per network pass")
     max_frames: int = Field(default=48, ge=1, description="observed frames kept, evenly spread")

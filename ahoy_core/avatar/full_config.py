@@ -94,7 +94,7 @@ class FullConfig(BaseModel):
 
     map_reduction: int = Field(default=2, ge=1, description="side of the template's maps over that of the pose maps")
     width: int = Field(default=16, ge=4, description="channels of the StyleUNet at its finest resolution")
-    steps: int = Field(default=160, ge=1, description="optimiser steps")
+    steps: int = Field(default=120, ge=1, description="optimiser steps")
     sequences_per_step: int = Field(default=2, ge=1, description="hallucinated sequences, one network pass each")
     shots_per_sequence: int = Field(default=3, ge=1, description="frames of each")
     frames_per_step: int = Field(default=2, ge=1, description="observed frames, of one map pose")
