@@ -29,6 +29,6 @@ def test_a_value_out_of_range_says_where_and_what() -> None:
 
 
 def test_draft_spends_less_and_high_more_than_standard() -> None:
-    for stage, knob in (("ingest", "max_size"), ("texture", "atlas_size"), ("coarse", "map_size"), ("coarse", "steps")):
+    for stage, knob in (("ingest", "max_size"), ("texture", "atlas_size"), ("coarse", "map_size")):
         values = [getattr(getattr(PRESETS[name], stage), knob) for name in ("draft", "standard", "high")]
         assert values[0] < values[1] < values[2], (stage, knob, values)
