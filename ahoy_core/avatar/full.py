@@ -54,7 +54,8 @@ def train_full(
     """Train the full avatar.
 
     One pass of the network per map pose serves all frames of a step that share it. The same inputs, configuration and
-    number of threads give the same avatar, bit for bit, also when it was interrupted and went on from a checkpoint.
+    number of threads give the same avatar, also when it was interrupted and went on from a checkpoint: bit for bit in a
+    process that does nothing else, to rounding (1e-8 was seen) after other work in it.
 
     Args:
         inputs: Observed frames, hallucinated sequences, face views, template.
