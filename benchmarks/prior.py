@@ -43,6 +43,7 @@ from ahoy_core.prior.video import VideoModel, load_video
 from ahoy_core.texture.atlas import ObservedAtlas
 from ahoy_core.texture.texture import Texture, TextureConfig, build_texture
 from benchmarks.prior_curves import draw_curves, identity, solvers
+from tasks.complete import CompleteConfig
 from tasks.fills import Fills
 from tasks.roles import perceptual_network
 
@@ -152,7 +153,8 @@ def capture_figures(video: VideoModel, capture: Capture, body: PackagedBody) -> 
 def self_checked(video: VideoModel, capture: Capture, body: PackagedBody, texture: Texture) -> dict[str, Any]:
     """The self-check on a capture's texture."""
     observed = ObservedAtlas(texture.observed_rgb, texture.coverage, texture.source_frame)
-    check = check_prior(video, CanonicalFill(body, true_fit(capture, body)["betas"], observed))
+    fill = CanonicalFill(body, true_fit(capture, body)["betas"], observed)
+    check = check_prior(video, fill, regions=CompleteConfig().regions)
     return {"errors": check.errors, "winner": check.winner, "regions": check.regions, "pixels": check.pixels}
 
 

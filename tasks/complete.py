@@ -33,7 +33,7 @@ class CompleteConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    regions: int = Field(default=3, ge=1, description="observed regions hidden one after the other")
+    regions: int = Field(default=8, ge=1, description="observed regions hidden one after the other")
     believe: Literal["winner", "prior"] = Field(
         default="winner", description="prior: whatever the self-check says, for comparisons"
     )
