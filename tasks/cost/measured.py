@@ -65,7 +65,7 @@ class MeasuredSet:
         found: dict[str, dict[Any, float]] = {}
         for row in self.whole:
             (knob, value), *_ = row.setting.items()
-            if knob != "preset":
+            if knob != "preset" and row.capture == base.capture:  # means over other captures say nothing
                 found.setdefault(knob, {})[value] = gain(row.errors, base.errors)
         return found
 

@@ -18,7 +18,7 @@ from ahoy_core.cost.pace import measure_pace
 from ahoy_core.cost.work import FRAMES, KNOBS, PIXELS, WORK, fit_times
 from tasks.cost.declared import STAGE_SWEEPS
 from tasks.cost.errors import SHARPNESS_DB, gain, psnr, rmse
-from tasks.cost.measured import read_measured, write_measured
+from tasks.cost.measured import MeasuredSet, read_measured, write_measured
 from tasks.cost.page import write_page
 from tasks.cost.predict import Clip, Predictor, gains_of, work_knobs
 from tasks.cost.rows import Rows
@@ -174,6 +174,18 @@ def test_both_fronts_of_whole_runs_are_marked(tmp_path: Path) -> None:
     ]
     marks = {row[1]: row[-1].removesuffix("|").strip() for row in cells}
     assert marks == {"draft": "PSNR, perceptual", "standard": "perceptual", "high": ""}
+
+
+def test_a_gain_is_over_the_same_captures() -> None:
+    rows = (
+        _whole("preset", "draft", 20.0, 60),
+        _whole("preset", "draft", 22.0, 60, capture="b"),
+        _whole("avatar.steps", 240, 20.5, 110),
+    )
+    found = MeasuredSet(rows, 0.03, {"cpu": "x"}, "draft", ())
+    assert found.gains() == {}, "half a decibel on the worse of two captures is no gain over the mean of both"
+    both = MeasuredSet((*rows, _whole("avatar.steps", 240, 22.1, 110, capture="b")), 0.03, {"cpu": "x"}, "draft", ())
+    assert both.gains()["avatar.steps"][240] == pytest.approx(0.3, abs=0.05)
 
 
 def test_a_prediction_knows_the_video_and_scales_with_the_machine(tmp_path: Path) -> None:
