@@ -54,7 +54,8 @@ def write_page(rows: Sequence[Measurement], facts: Mapping[str, Any], page: Path
         error, unit = DRAWN[name]
         picture = page.parent / f"{page.stem}-{name}.png"
         parts += [f"## {name.capitalize()}", _said_of(name)]
-        if draw([row for row in mine if row.capture == mine[0].capture], error, unit, picture, minutes=name == END_TO_END):
+        alike = [row for row in mine if row.capture == mine[0].capture]
+        if draw(alike, error, unit, picture, minutes=name == END_TO_END):
             written.append(picture)
             parts.append(f"![{error.replace('_', ' ')} over CPU time]({picture.name})")
         parts.append(_whole_table(mine) if name == END_TO_END else _table(mine, error))
