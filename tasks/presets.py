@@ -44,7 +44,6 @@ PRESETS: Mapping[Preset, Settings] = {
             "texture.canonical_width=768",
             "coarse.map_size=512",
             "coarse.steps=100",
-            "identity.steps=160",
             "identity.frames=48",
             "motions.limit=5",
             "avatar.steps=160",

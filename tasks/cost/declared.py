@@ -126,7 +126,7 @@ END_TO_END_REFERENCE = (
 NOT_SWEPT: Mapping[str, str] = {
     "ingest": "its knobs say what later stages see: swept end to end",
     "complete": "what it chooses between is measured by benchmarks.prior: docs/prior.md",
-    "identity": "rank and steps were not swept on the shipped prior yet; what it does to colours: docs/prior.md",
+    "identity": "rank and steps are measured by benchmarks.prior: docs/prior.md",
     "motions": "a plan, made in under a second",
     "hallucinate": "solvers and evaluations are measured by benchmarks.prior: docs/prior.md",
     "animate": "its knobs change size and length of the videos, not how right they are; effects: docs/render.md",
