@@ -165,7 +165,7 @@ def _roles(config: CompleteConfig) -> Mapping[str, Role]:
 
 COMPLETE = Stage(
     "complete",
-    7,
+    8,
     CompleteConfig,
     ("perceive", "texture"),
     run_complete,

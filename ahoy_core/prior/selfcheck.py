@@ -20,9 +20,9 @@ Repaint = Callable[[Pictures], Tensor]
 """Pictures with guesses -> [T,3,H,W] with better ones."""
 
 BASELINE: Final = "symmetric fill"
-MARGIN: Final = 0.05
-"""Share by which a fill must be closer than a simpler one: a few hundred pixels of two or three regions decide, and
-wins by less were worth nothing in whole runs (docs/prior.md)."""
+MARGIN: Final = 0.03
+"""Share by which a fill must be closer than a simpler one: about what the winner moves by from one draw of eight regions
+to the next (docs/prior.md). Two draws of two regions differ by more."""
 _MIN_OBSERVED: Final = 40  # surface points: with fewer there is nothing to hide
 _MIN_PIXELS: Final = 30
 
