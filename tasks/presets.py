@@ -1,9 +1,9 @@
 """Three ways to spend time, picked from what was measured (docs/cost.md, end to end).
 
 What each costs and scores is its row `preset`, which `ahoy run` cites. `draft` is what knobs are changed around.
-`standard` takes what paid: maps of 256 (perceptual distance .166 for .179), 30 iterations of the fit (on capture a .03 dB
-and .005), an atlas of 512, eight hidden regions for the self-check; more steps than draft's, in either training, bought
-nothing. `high` has no row yet: its sizes are for larger pictures than those of the captures, where they gain nothing.
+`standard` takes what paid: maps of 256 (perceptual distance .166 for .179), 30 iterations of the fit (on capture a
+.03 dB and .005), an atlas of 512, eight hidden regions for the self-check; more steps than draft's, in either training,
+bought nothing. `high` has no row yet: its sizes are for larger pictures than the captures', where they gain nothing.
 """
 
 from __future__ import annotations

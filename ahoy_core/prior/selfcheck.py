@@ -21,8 +21,8 @@ Repaint = Callable[[Pictures], Tensor]
 
 BASELINE: Final = "symmetric fill"
 MARGIN: Final = 0.03
-"""Share by which a fill must be closer than a simpler one: about what the winner moves by from one draw of eight regions
-to the next (docs/prior.md). Two draws of two regions differ by more."""
+"""Share by which a fill must be closer than a simpler one: about what the winner moves by from one draw of eight
+regions to the next (docs/prior.md). Two draws of two regions differ by more."""
 _MIN_OBSERVED: Final = 40  # surface points: with fewer there is nothing to hide
 _MIN_PIXELS: Final = 30
 
