@@ -55,7 +55,7 @@ def train_full(
 
     One pass of the network per map pose serves all frames of a step that share it. The same inputs, configuration and
     number of threads give the same avatar, also when it was interrupted and went on from a checkpoint: bit for bit in a
-    process that does nothing else, to rounding (1e-8 was seen) after other work in it.
+    process that does nothing else; after other work in it, but for rounding and what Adam makes of that.
 
     Args:
         inputs: Observed frames, hallucinated sequences, face views, template.
