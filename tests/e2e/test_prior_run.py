@@ -55,7 +55,7 @@ def test_the_packaged_prior_is_asked_where_a_run_says_nothing_else(small_run: Sm
 
 def test_a_prior_that_loses_its_self_check_changes_nothing(small_run: SmallRun, embedded_folder: Path) -> None:  # noqa: F811
     small_run.again(knobs=["prior=none"])
-    before = {row["stage"]: row["key"] for row in _latest(small_run)}
+
     output = small_run.again(knobs=[f"prior={embedded_folder}", *SHORT]).output
     rows = {row["stage"]: row for row in _latest(small_run)}
     assert "did not win this video's self-check" in rows["identity"]["reason"], output
@@ -66,8 +66,6 @@ def test_a_prior_that_loses_its_self_check_changes_nothing(small_run: SmallRun, 
     texture = _manifest(small_run, rows["texture"])[1]
     for name in ("atlas.npz", "canonical.npz"):
         assert (folder / name).read_bytes() == (texture / name).read_bytes()
-    # The same inputs: trainings of them differ by rounding, which an optimiser's first steps enlarge.
-    assert rows["coarse"]["key"] == before["coarse"]
     assert {rows[stage]["state"] for stage in ("identity", "motions", "hallucinate")} == {"skipped"}
 
 
