@@ -54,8 +54,6 @@ def test_the_packaged_prior_is_asked_where_a_run_says_nothing_else(small_run: Sm
 
 
 def test_a_prior_that_loses_its_self_check_changes_nothing(small_run: SmallRun, embedded_folder: Path) -> None:  # noqa: F811
-    small_run.again(knobs=["prior=none"])
-
     output = small_run.again(knobs=[f"prior={embedded_folder}", *SHORT]).output
     rows = {row["stage"]: row for row in _latest(small_run)}
     assert "did not win this video's self-check" in rows["identity"]["reason"], output
