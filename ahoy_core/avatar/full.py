@@ -54,8 +54,7 @@ def train_full(
     """Train the full avatar.
 
     One pass of the network per map pose serves all frames of a step that share it. The same inputs, configuration and
-    number of threads give the same avatar, also when it was interrupted and went on from a checkpoint: bit for bit in a
-    process that does nothing else; after other work in it, but for rounding and what Adam makes of that.
+    number of threads give the same avatar, bit for bit, also when it was interrupted and went on from a checkpoint.
 
     Args:
         inputs: Observed frames, hallucinated sequences, face views, template.

@@ -78,6 +78,11 @@ class PoseMaps:
         return avg_pool2d(taken, self.reduction).clamp(min=1e-6)
 
     def gather(self, maps: Tensor) -> Tensor:
-        """Read maps [2,C,size,size] at the Gaussians' pixels: [N,C]."""
+        """Read maps [2,C,size,size] at the Gaussians' pixels: [N,C].
+
+        Not by indexing with tensors: Gaussians share reduced pixels, and that one's gradient adds theirs up in
+        whatever order the threads come.
+        """
         side, row, column = self.template.pixels.unbind(1)
-        return maps[side, :, row // self.reduction, column // self.reduction]
+        flat = (side * self.size + row // self.reduction) * self.size + column // self.reduction
+        return maps.movedim(1, -1).flatten(0, 2).index_select(0, flat)

@@ -55,6 +55,20 @@ def test_reduced_maps_hold_the_mean_of_each_block_and_are_read_back_by_it():
     assert torch.equal(read[100], small[0, 7 * side : 7 * side + 7, row // 2, column // 2])
 
 
+def test_gradients_of_shared_pixels_repeat_bit_for_bit_on_several_threads():
+    maps = _maps(reduction=4)
+    generator = torch.Generator().manual_seed(0)
+    read = torch.randn(len(template().means), 256, generator=generator)  # enough for PyTorch to share the work out
+    values = torch.randn(2, 256, maps.size, maps.size, generator=generator, requires_grad=True)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        found = [torch.autograd.grad((maps.gather(values) * read).sum(), values)[0] for _ in range(40)]
+    finally:
+        torch.set_num_threads(threads)
+    assert all(torch.equal(one, found[0]) for one in found)
+
+
 def test_projection_leaves_training_poses_and_what_lies_between_them():
     poses = torch.stack([_rotations(angle) for angle in (0.0, 0.4, 0.8)])
     prior = PosePrior.of(poses)

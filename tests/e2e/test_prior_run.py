@@ -54,6 +54,8 @@ def test_the_packaged_prior_is_asked_where_a_run_says_nothing_else(small_run: Sm
 
 
 def test_a_prior_that_loses_its_self_check_changes_nothing(small_run: SmallRun, embedded_folder: Path) -> None:  # noqa: F811
+    small_run.again(knobs=["prior=none"])
+    before = {row["stage"]: row["key"] for row in _latest(small_run)}
     output = small_run.again(knobs=[f"prior={embedded_folder}", *SHORT]).output
     rows = {row["stage"]: row for row in _latest(small_run)}
     assert "did not win this video's self-check" in rows["identity"]["reason"], output
@@ -65,6 +67,11 @@ def test_a_prior_that_loses_its_self_check_changes_nothing(small_run: SmallRun, 
     for name in ("atlas.npz", "canonical.npz"):
         assert (folder / name).read_bytes() == (texture / name).read_bytes()
     assert {rows[stage]["state"] for stage in ("identity", "motions", "hallucinate")} == {"skipped"}
+    store = ArtifactStore(small_run.out / "store")
+    for stage in ("coarse", "avatar"):
+        then, now = store.lookup(before[stage], stage=stage), store.lookup(rows[stage]["key"], stage=stage)
+        assert then is not None and now is not None
+        assert then.blob("avatar.safetensors").sha256 == now.blob("avatar.safetensors").sha256, stage
 
 
 @pytest.fixture(scope="module")
