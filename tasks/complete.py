@@ -51,7 +51,7 @@ def run_complete(config: CompleteConfig, ctx: StageContext) -> StageOutput:
     video = open_prior(ctx.prior, ctx.fills)
     told = json.loads((ctx.inputs["texture"] / "texture.json").read_text(encoding="utf-8"))
     fill = CanonicalFill(body, betas, observed, video.size, **told["filled_with"])
-    check = check_prior(video, fill, config.seed, config.regions)
+    check = check_prior(video, fill, config.regions, config.seed)
     winner = check.winner if config.believe == "winner" else _best_prior(video, check.errors)
     used = winner != BASELINE
     if used:

@@ -16,15 +16,16 @@ from ahoy_core.prior.bodymaps import light_maps
 from ahoy_core.prior.completion import Pictures, canonical_context, repaint
 from ahoy_core.prior.config import PriorConfig
 from ahoy_core.prior.framing import HEIGHT, WIDTH
-from ahoy_core.prior.light import brightness_on
 from ahoy_core.prior.selfcheck import SelfCheck, self_check
 from ahoy_core.prior.video import VideoModel
 from ahoy_core.texture.atlas import ObservedAtlas
 from ahoy_core.texture.canonical import canonical_views
 from ahoy_core.texture.fill import FillKind, fill_atlas
+from ahoy_core.texture.light import shading
 from ahoy_core.texture.surface import Surface
 from ahoy_core.texture.texels import texel_map
 from ahoy_core.texture.texture import canonical_vertices
+from ahoy_core.texture.tones import vertex_normals
 
 Array = NDArray[Any]
 
@@ -72,7 +73,7 @@ class CanonicalFill:
         self._vertices = canonical_vertices(body, betas)
         self.points = self._texels.points(self._vertices, self._surface.faces)
         self.observed: Array = observed.coverage.ravel()[self._texels.flat] > 0
-        self._body, self._betas = body, betas
+        self._body, self._normals = body, vertex_normals(self._surface, self._vertices)
         self.maps, self.azimuth = canonical_context(body, torch.from_numpy(self._vertices), size)
 
     def __call__(self, kept: Tensor) -> Pictures:
@@ -92,12 +93,11 @@ class CanonicalFill:
         alpha = rgba[:, 3:]
         coverage = torch.from_numpy(made.coverage)[:, None].float() / 255
         posed = torch.from_numpy(self._vertices).expand(4, -1, -1)
-        brightness = brightness_on(self._body, self._betas, np.array(filled.light))
-        light = light_maps(self._body, posed, made.cameras, brightness)
+        light = light_maps(self._body, posed, made.cameras, shading(self._normals, np.array(filled.light)))
         return Pictures(rgba[:, :3] * alpha + GREY * (1 - alpha), alpha, coverage, moving=False, light=light)
 
 
-def check_prior(video: VideoModel, fill: CanonicalFill, seed: int = 0, regions: int = 3) -> SelfCheck:
+def check_prior(video: VideoModel, fill: CanonicalFill, regions: int, seed: int = 0) -> SelfCheck:
     """The prior's ways against the symmetric fill on hidden parts of what a video showed.
 
     The clean-up takes part where the prior reads coarse latents.

@@ -10,7 +10,7 @@ from ahoy_core.cost.sweep import Measurement, Spread, pareto
 from tasks.cost.declared import END_TO_END, END_TO_END_REFERENCE, STAGE_SWEEPS
 from tasks.cost.errors import psnr
 from tasks.cost.plots import draw
-from tasks.cost.summary import DRAWN, of_sweep, omissions, over_captures, shown
+from tasks.cost.summary import DRAWN, alike, of_sweep, omissions, over_captures, shown
 
 HEAD = """# What accuracy costs in time
 
@@ -50,12 +50,11 @@ def write_page(rows: Sequence[Measurement], facts: Mapping[str, Any], page: Path
     parts = [HEAD.format(base=facts["base"], captures=captures, machine=facts["machine"])]
     written = [page]
     for name in (END_TO_END, *STAGE_SWEEPS):
-        mine = sorted(of_sweep(means, name), key=lambda row: -row.capture.count(","))
+        mine = of_sweep(means, name)
         error, unit = DRAWN[name]
         picture = page.parent / f"{page.stem}-{name}.png"
         parts += [f"## {name.capitalize()}", _said_of(name)]
-        alike = [row for row in mine if row.capture == mine[0].capture]
-        if draw(alike, error, unit, picture, minutes=name == END_TO_END):
+        if draw(alike(mine), error, unit, picture, minutes=name == END_TO_END):
             written.append(picture)
             parts.append(f"![{error.replace('_', ' ')} over CPU time]({picture.name})")
         parts.append(_whole_table(mine) if name == END_TO_END else _table(mine, error))
@@ -91,9 +90,8 @@ def _table(rows: Sequence[Measurement], error: str) -> str:
 def _whole_table(rows: Sequence[Measurement]) -> str:
     if not rows:
         return "Not measured yet."
-    # Means are compared with means over the same captures alone.
-    like = [row for row in rows if row.capture == rows[0].capture]
-    fronts = {word: {id(row) for row in pareto(like, error)} for word, error in _FRONTS.items()}
+    comparable = alike(rows)
+    fronts = {word: {id(row) for row in pareto(comparable, error)} for word, error in _FRONTS.items()}
     stages = [name for name in rows[0].parts if any(row.parts.get(name, 0) >= 0.5 for row in rows)]
     words = ["PSNR, dB", "novel view", "novel pose", "head", "SSIM", "perceptual"]
     head = ["setting", "value", "CPU minutes", *words, "MB", *stages, "Pareto"]
@@ -105,7 +103,7 @@ def _whole_table(rows: Sequence[Measurement]) -> str:
         minutes = f"{row.cpu_s.median / 60:.2f}" if row.cpu_s else "-"
         mark = ", ".join(word for word, front in fronts.items() if id(row) in front)
         seconds = [f"{row.parts.get(name, 0.0):.1f}" for name in stages]
-        value = shown(row.setting) + ("" if row.capture == rows[0].capture else f" ({row.capture} alone)")
+        value = shown(row.setting) + ("" if row in comparable else f" ({row.capture} alone)")
         cells = [row.sweep.partition(".")[2], value, minutes, *scores, _whole(row.peak_mb), *seconds]
         lines.append(_line([*cells, mark]))
     lines += ["", _WHOLE_WORDS]

@@ -55,6 +55,12 @@ def _together(spreads: Sequence[Spread | None]) -> Spread | None:
     )
 
 
+def alike(rows: Sequence[Measurement]) -> list[Measurement]:
+    """Rows over the captures that most were run on, as far as one row says: means over others do not compare."""
+    most = max((row.capture for row in rows), key=lambda names: names.count(","), default="")
+    return [row for row in rows if row.capture == most]
+
+
 def of_sweep(rows: Sequence[Measurement], name: str) -> list[Measurement]:
     """Rows of one stage, or of whole runs, by knob and value."""
     return [row for row in rows if row.sweep.partition(".")[0] == name]

@@ -32,3 +32,5 @@ def test_draft_spends_less_and_high_more_than_standard() -> None:
     for stage, knob in (("ingest", "max_size"), ("texture", "atlas_size"), ("coarse", "map_size")):
         values = [getattr(getattr(PRESETS[name], stage), knob) for name in ("draft", "standard", "high")]
         assert values[0] < values[1] < values[2], (stage, knob, values)
+    steps = [PRESETS[name].coarse.steps for name in ("draft", "standard", "high")]
+    assert steps[0] == steps[1] < steps[2], "standard's row with draft's steps is the better one (docs/cost.md)"
