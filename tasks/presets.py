@@ -25,7 +25,6 @@ PRESETS: Mapping[Preset, Settings] = {
             "texture.canonical_height=256",
             "texture.canonical_width=192",
             "coarse.map_size=128",
-            "complete.regions=2",
             "identity.steps=40",
             "motions.limit=2",
             "animate.height=256",
