@@ -79,8 +79,8 @@ def stage_rows(
         bench = _Bench(base, declared, Path(scratch))
         for knob, choices in values.items():
             name = f"{declared.stage.name}.{knob}"
-            hashes = {bench.made_of({knob: value}, repeats): {knob: value} for value in choices}
-            left = {made_of: setting for made_of, setting in hashes.items() if not rows.reuse(made_of, name, setting)}
+            hashes = {bench.made_of({knob: value}): {knob: value} for value in choices}
+            left = {key: setting for key, setting in hashes.items() if not rows.reuse(key, name, setting, repeats)}
             told(f"{base.capture.name}, {name}: {len(left)} of {len(hashes)} to measure")
             if left:
                 bench.warm()
@@ -129,12 +129,12 @@ class _Bench:
         """Errors of an output folder."""
         return self._declared.errors(self._capture, self._folders, made)
 
-    def made_of(self, setting: Mapping[str, Any], repeats: int) -> str:
+    def made_of(self, setting: Mapping[str, Any]) -> str:
         """Hash of all that a row depends on."""
         known = {name: str(value) for name, value in self._declared.knows(self._capture).items()}
         knobs = {**self._config.model_dump(mode="json"), **known, **setting}
         stage = self._declared.stage
-        return _hash([stage.name, stage.version, repeats, knobs, self._hashes])
+        return _hash([stage.name, stage.version, knobs, self._hashes])
 
     def knobs(self, setting: Mapping[str, Any]) -> dict[str, Any]:
         """What decides the work at a setting."""
@@ -162,30 +162,37 @@ def _inputs(base: Base, declared: StageSweep, run: Run) -> dict[str, StageRef]:
     return {name: made.refs[name] for name in needs}
 
 
-def whole_rows(base: Base, settings: Mapping[str, EvaluateRequest], rows: Rows, told: Told) -> None:
+def whole_rows(
+    base: Base, settings: Mapping[str, EvaluateRequest], repeats: int, rows: Rows, told: Told
+) -> None:
     """Whole runs on one capture, each scored against the truth.
 
-    A run's seconds are the bills of its stages, those that another run of this sweep left in the store too.
+    A run's seconds are the bills of its stages, those that another run of this sweep left in the store too. Every
+    repeat has a store of its own, so that none finds what another has made.
 
     Args:
         base: the capture.
         settings: by what is said of the row (`preset=draft`, `avatar.steps=60`), the request that it stands for.
+        repeats: runs of every setting; they make the same avatar, so the first is scored.
         rows: where rows are kept.
         told: called with a line on each run.
     """
+    again = Path(base.request.out) / "repeats"
+    stores = [base.store, *(ArtifactStore(again / str(number)) for number in range(2, repeats + 1))]
     for said, request in settings.items():
-        subject = replace(base, request=request).subject
+        subjects = [replace(base, request=request, store=store).subject for store in stores]
+        subject = subjects[0]
         chosen = subject.settings("full")
         versions = {stage.name: stage.version for stage in STAGES}
         asked = _prior(subject.run())
         made_of = _hash([chosen.model_dump(mode="json"), versions, asked, subject.truth.content_hash, request.size])
         knob, _, value = said.partition("=")
-        if rows.reuse(made_of, f"end-to-end.{knob}", {knob: _plain(value)}):
+        if rows.reuse(made_of, f"end-to-end.{knob}", {knob: _plain(value)}, repeats):
             continue
         told(f"{base.capture.name}, end to end: {said}")
         row = Measurement(f"end-to-end.{knob}", {knob: _plain(value)}, capture=base.capture.name, made_of=made_of)
         try:
-            rows.add(_whole(row, subject))
+            rows.add(_whole(row, subjects))
         except Exception as problem:  # a run that fails is a finding about that setting
             rows.add(replace(row, failed=f"{type(problem).__name__}: {problem}"))
 
@@ -195,22 +202,30 @@ def _prior(run: Run) -> str:
     return no_prior(run.prior, run.body, run.fills) or prior_role(run.prior).weights_sha256
 
 
-def _whole(row: Measurement, subject: Subject) -> Measurement:
-    outcome, _ = stages_up_to(subject, "full", END, subject.run())
-    folders = {name: _folder(subject.store, outcome.refs[name]) for name in ("ingest", "avatar")}
-    bills = [ref.bill for ref in outcome.refs.values()]
-    parts: dict[str, float] = {}
-    for ref in outcome.refs.values():
-        parts[ref.stage] = parts.get(ref.stage, 0.0) + ref.bill.cpu_s
+def _whole(row: Measurement, subjects: Sequence[Subject]) -> Measurement:
+    made = [stages_up_to(subject, "full", END, subject.run())[0].refs for subject in subjects]
+    bills = [[ref.bill for ref in refs.values()] for refs in made]
+    subject, refs = subjects[0], made[0]
+    folders = {name: _folder(subject.store, refs[name]) for name in ("ingest", "avatar")}
     return replace(
         row,
         errors=whole_errors(load_avatar(folders["avatar"]), subject.capture, subject.request.size),
-        wall_s=Spread.of([sum(bill.wall_s for bill in bills)]),
-        cpu_s=Spread.of([sum(bill.cpu_s for bill in bills)]),
-        peak_mb=Spread.of([max(bill.peak_rss_mb for bill in bills)]),
+        wall_s=Spread.of([sum(bill.wall_s for bill in one) for one in bills]),
+        cpu_s=Spread.of([sum(bill.cpu_s for bill in one) for one in bills]),
+        peak_mb=Spread.of([max(bill.peak_rss_mb for bill in one) for one in bills]),
         knobs=work_knobs(subject.settings("full"), ingested(folders["ingest"])),
-        parts=parts,
+        parts=_parts(made),
     )
+
+
+def _parts(made: Sequence[Mapping[str, StageRef]]) -> dict[str, float]:
+    """Stage -> CPU seconds, a stage's parts taken together, the median over repeats."""
+    spent: dict[str, list[float]] = {}
+    for number, refs in enumerate(made):
+        for ref in refs.values():
+            one = spent.setdefault(ref.stage, [0.0] * len(made))
+            one[number] += ref.bill.cpu_s
+    return {stage: Spread.of(one).median for stage, one in spent.items()}
 
 
 def _folder(store: ArtifactStore, ref: StageRef) -> Path:

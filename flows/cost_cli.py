@@ -35,7 +35,7 @@ def cost(
     knob: Annotated[
         list[str] | None, typer.Option(help="only this, with other values: STAGE.KNOB=A,B,...; repeatable")
     ] = None,
-    repeats: Annotated[int, typer.Option(min=1, help="runs of every setting of a stage")] = 3,
+    repeats: Annotated[int, typer.Option(min=1, help="runs of every setting")] = 3,
     size: Annotated[int, typer.Option(min=32, help="longest side of what is compared end to end, pixels")] = 256,
     threads: Annotated[int, typer.Option(min=1, help="of every computation: more make CPU seconds dearer")] = 1,
     store: Annotated[str | None, typer.Option(help="URL of the artifact store  [default: OUT/store]")] = None,
@@ -115,7 +115,7 @@ def _measure(
         base = Base(request, capture, artifacts, observer)
         for name, values in wanted.items():
             if name == END_TO_END:
-                whole_rows(base, _requests(request, values), rows, told)
+                whole_rows(base, _requests(request, values), repeats, rows, told)
             else:
                 stage_rows(base, STAGE_SWEEPS[name], values, repeats, rows, told)
 

@@ -94,27 +94,26 @@ def _whole_table(rows: Sequence[Measurement]) -> str:
     fronts = {word: {id(row) for row in pareto(comparable, error)} for word, error in _FRONTS.items()}
     stages = [name for name in rows[0].parts if any(row.parts.get(name, 0) >= 0.5 for row in rows)]
     words = ["PSNR, dB", "novel view", "novel pose", "head", "SSIM", "perceptual"]
-    head = ["setting", "value", "CPU minutes", *words, "MB", *stages, "Pareto"]
+    head = ["setting", "value", "CPU minutes", "range", *words, "MB", *stages, "Pareto"]
     lines = [_line(head), _line(["---"] * len(head))]
     for row in rows:
         scores = [f"{psnr(row.errors[name]):.2f}" for name in ("rmse", "view_rmse", "pose_rmse", "head_rmse")]
         scores.append(f"{1 - row.errors['ssim_loss']:.3f}" if "ssim_loss" in row.errors else "-")
         scores.append(_figure(row.errors.get("perceptual")))
-        minutes = f"{row.cpu_s.median / 60:.2f}" if row.cpu_s else "-"
         mark = ", ".join(word for word, front in fronts.items() if id(row) in front)
         seconds = [f"{row.parts.get(name, 0.0):.1f}" for name in stages]
         value = shown(row.setting) + ("" if row in comparable else f" ({row.capture} alone)")
-        cells = [row.sweep.partition(".")[2], value, minutes, *scores, _whole(row.peak_mb), *seconds]
+        cells = [row.sweep.partition(".")[2], value, *_time(row.cpu_s, 60), *scores, _whole(row.peak_mb), *seconds]
         lines.append(_line([*cells, mark]))
     lines += ["", _WHOLE_WORDS]
     return "\n".join(lines)
 
 
-def _time(spread: Spread | None) -> tuple[str, str]:
+def _time(spread: Spread | None, unit_s: float = 1.0) -> tuple[str, str]:
     if spread is None:
         return "-", "-"
-    between = f"{spread.low:.2f}-{spread.high:.2f}" if spread.repeats > 1 else "once"
-    return f"{spread.median:.2f}", between
+    between = f"{spread.low / unit_s:.2f}-{spread.high / unit_s:.2f}" if spread.repeats > 1 else "once"
+    return f"{spread.median / unit_s:.2f}", between
 
 
 def _whole(spread: Spread | None) -> str:

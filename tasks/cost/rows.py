@@ -32,13 +32,13 @@ class Rows:
                 self._path.write_bytes(text[: text.rfind(b"\n") + 1])
         self.rows: list[Measurement] = read_jsonl(self._path) if self._path.is_file() else []
 
-    def reuse(self, made_of: str, sweep: str, setting: Mapping[str, Any]) -> bool:
+    def reuse(self, made_of: str, sweep: str, setting: Mapping[str, Any], repeats: int) -> bool:
         """Whether a row with this hash is there, under the name of this sweep or, from now on, also under it.
 
         The base value of a knob is a setting of every other knob's sweep too, and needs measuring once. A setting that
-        failed is tried again.
+        failed, or was run less often than is asked now, is tried again.
         """
-        same = [row for row in self.rows if row.made_of == made_of and not row.failed]
+        same = [row for row in self.rows if row.made_of == made_of and row.cpu_s and row.cpu_s.repeats >= repeats]
         if not same:
             return False
         if all(row.sweep != sweep for row in same):
@@ -46,7 +46,7 @@ class Rows:
         return True
 
     def add(self, row: Measurement) -> None:
-        """Keep a row; it replaces one of the same setting that failed."""
+        """Keep a row; it replaces one of the same setting."""
         stale = [old for old in self.rows if (old.sweep, old.setting, old.capture) == _which(row)]
         self.rows = [old for old in self.rows if old not in stale] + [row]
         text = "".join(json.dumps(dataclasses.asdict(one)) + "\n" for one in (self.rows if stale else [row]))

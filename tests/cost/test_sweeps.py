@@ -210,7 +210,8 @@ def test_rows_are_found_again_shared_between_sweeps_and_survive_a_torn_line(tmp_
         file.write('{"sweep": "coarse.st')
     rows = Rows(tmp_path)
     assert rows.rows == [row]
-    assert rows.reuse("h1", "coarse.width", {"width": 16}) and not rows.reuse("h2", "coarse.steps", {"steps": 30})
+    assert rows.reuse("h1", "coarse.width", {"width": 16}, 1) and not rows.reuse("h2", "coarse.steps", {"steps": 30}, 1)
+    assert not rows.reuse("h1", "coarse.width", {"width": 16}, 2), "run once, asked for twice"
     assert [(one.sweep, dict(one.setting)) for one in Rows(tmp_path).rows] == [
         ("coarse.steps", {"steps": 60}), ("coarse.width", {"width": 16}),
     ]  # fmt: skip
@@ -220,7 +221,7 @@ def test_a_failed_row_is_tried_again_and_replaced(tmp_path: Path) -> None:
     bad = Measurement("coarse.steps", {"steps": 1}, failed="ValueError: no", capture="a", made_of="h")
     rows = Rows(tmp_path)
     rows.add(bad)
-    assert not rows.reuse("h", "coarse.steps", {"steps": 1})
+    assert not rows.reuse("h", "coarse.steps", {"steps": 1}, 1)
     good = replace(bad, failed="", errors={"rmse": 1.0}, cpu_s=_once(1), wall_s=_once(1))
     rows.add(good)
     assert Rows(tmp_path).rows == [good]
