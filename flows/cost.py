@@ -29,11 +29,11 @@ from tasks.cost.declared import StageSweep
 from tasks.cost.errors import whole_errors
 from tasks.cost.predict import ingested, work_knobs
 from tasks.cost.rows import Rows
-from tasks.cost.truth import TruthConfig, truth_stage
+from tasks.cost.truth import truth_stage
 from tasks.prior_folder import no_prior, prior_role
 from tasks.running import resolve_inputs, run_stage
 from tasks.settings import Settings
-from tasks.stage import Observer, Run, Source, Stage, StageContext, StageRef
+from tasks.stage import NoKnobs, Observer, Run, Source, Stage, StageContext, StageRef
 from tasks.stages import STAGES
 
 Told = Callable[[str], None]
@@ -154,7 +154,7 @@ def _inputs(base: Base, declared: StageSweep, run: Run) -> dict[str, StageRef]:
     def call(stage: Stage, settings: Settings, inputs: Mapping[str, StageRef | Source], run: Run) -> StageRef:
         if stage.name == "perceive" and declared.true_bodies:
             named = {"capture": subject.truth, "ingest": inputs["ingest"]}
-            return run_stage(truth_stage(base.capture), TruthConfig(), named, run)
+            return run_stage(truth_stage(base.capture), NoKnobs(), named, run)
         return call_directly(stage, settings, inputs, run)
 
     needs = declared.stage.needs
@@ -162,9 +162,7 @@ def _inputs(base: Base, declared: StageSweep, run: Run) -> dict[str, StageRef]:
     return {name: made.refs[name] for name in needs}
 
 
-def whole_rows(
-    base: Base, settings: Mapping[str, EvaluateRequest], repeats: int, rows: Rows, told: Told
-) -> None:
+def whole_rows(base: Base, settings: Mapping[str, EvaluateRequest], repeats: int, rows: Rows, told: Told) -> None:
     """Whole runs on one capture, each scored against the truth.
 
     A run's seconds are the bills of its stages, those that another run of this sweep left in the store too. Every

@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, select_autoescape
-from pydantic import BaseModel, ConfigDict
 
 from storage_schema.store import Manifest
 from tasks.roles import packaged
-from tasks.stage import Stage, StageContext, StageOutput
+from tasks.stage import NoKnobs, Stage, StageContext, StageOutput
 
 STEPS = {
     "complete": "complete: the prior against the symmetric fill of the texture (3.1)",
@@ -66,13 +65,7 @@ CAPTIONS = {
 }
 
 
-class ReportConfig(BaseModel):
-    """The report has no knobs; its place in the settings keeps every stage alike."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-def run_report(config: ReportConfig, ctx: StageContext) -> StageOutput:
+def run_report(config: NoKnobs, ctx: StageContext) -> StageOutput:
     """Write `report.html`."""
     text = page_environment().get_template("report.html.j2").render(**_content(ctx))
     (ctx.out / "report.html").write_text(text, encoding="utf-8")
@@ -150,7 +143,7 @@ def _base64(path: Path) -> str:
 REPORT = Stage(
     "report",
     5,
-    ReportConfig,
+    NoKnobs,
     ("ingest", "perceive", "texture", "coarse", "avatar", "animate"),
     run_report,
     # The bill is predicted from it.

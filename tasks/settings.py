@@ -18,7 +18,7 @@ from tasks.complete import CompleteConfig
 from tasks.hallucinate import HallucinateConfig
 from tasks.identity import IdentityStageConfig
 from tasks.motions import MotionsConfig
-from tasks.report import ReportConfig
+from tasks.stage import NoKnobs
 
 Preset = Literal["draft", "standard", "high"]
 
@@ -40,7 +40,7 @@ class Settings(BaseModel):
     hallucinate: HallucinateConfig = HallucinateConfig()
     avatar: FullConfig = FullConfig()
     animate: AnimateConfig = AnimateConfig()
-    report: ReportConfig = ReportConfig()
+    report: NoKnobs = NoKnobs()
 
     def with_overrides(self, overrides: Iterable[str]) -> Settings:
         """Return a copy with `stage.knob=value` (or `stage.group.knob=value`) applied, validated like any settings.

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
-from pydantic import BaseModel
+from pydantic import BaseModel, ConfigDict
 
 from ahoy_core.body.load import PACKAGED
 from ahoy_core.cost.meter import Bill
@@ -81,6 +81,12 @@ class StageContext:
     item: str = ""
     skipped: Mapping[str, str] = field(default_factory=dict)
     fills: Fills = field(default_factory=Fills)
+
+
+class NoKnobs(BaseModel):
+    """Of a stage that has none; its place in the settings keeps every stage alike."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
 
 
 @dataclass(frozen=True)

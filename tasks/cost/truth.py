@@ -9,7 +9,6 @@ import json
 
 import numpy as np
 import torch
-from pydantic import BaseModel, ConfigDict
 
 from ahoy_core.body.packaged import PackagedBody, load_packaged_body
 from ahoy_core.captures.capture import Capture
@@ -18,15 +17,9 @@ from ahoy_core.formats.images import write_png
 from ahoy_core.formats.npz import load_npz, save_npz
 from ahoy_core.metrics.regions import mask_box
 from ahoy_core.texture.rays import Caster, hit_map, to_camera
-from tasks.stage import Stage, StageContext, StageOutput
+from tasks.stage import NoKnobs, Stage, StageContext, StageOutput
 
 LANDMARKS = 33
-
-
-class TruthConfig(BaseModel):
-    """No knobs."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
 
 def truth_stage(capture: Capture) -> Stage:
@@ -36,12 +29,12 @@ def truth_stage(capture: Capture) -> Stage:
         ValueError: the capture has no true masks of every frame.
     """
 
-    def run(config: TruthConfig, ctx: StageContext) -> StageOutput:
+    def run(config: NoKnobs, ctx: StageContext) -> StageOutput:
         video = load_npz(ctx.inputs["ingest"] / "frames.npz", ["frames", "index"])
         write_truth(capture, load_packaged_body(), video, ctx)
         return StageOutput({"facts": {"frames": len(video["index"])}})
 
-    return Stage("truth", 1, TruthConfig, ("capture", "ingest"), run)
+    return Stage("truth", 1, NoKnobs, ("capture", "ingest"), run)
 
 
 def write_truth(capture: Capture, body: PackagedBody, video: dict[str, np.ndarray], ctx: StageContext) -> None:

@@ -24,8 +24,8 @@ def test_every_repeat_of_a_whole_run_is_made_anew_and_makes_the_same(tmp_path: P
 
     def sweep(repeats: int) -> str:
         result = CliRunner().invoke(app, [
-            "cost", "end-to-end", "--dataset", str(shared_dir / "captures"), "--only", "a", "--presets", "", "--size", "64",
-            "--knob", "coarse.steps=1", "--repeats", str(repeats), "--out", str(out), *options,
+            "cost", "end-to-end", "--dataset", str(shared_dir / "captures"), "--only", "a", "--presets", "",
+            "--knob", "coarse.steps=1", "--repeats", str(repeats), "--size", "64", "--out", str(out), *options,
         ])  # fmt: skip
         assert result.exit_code == 0, result.output
         return result.output
