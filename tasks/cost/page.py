@@ -21,7 +21,8 @@ missing stands under [omissions](#omissions).
 
 Each knob is changed alone, the others as the base settings say ({base}). Seconds are CPU seconds of the whole process,
 memory is the most that the process held while it ran (it keeps what earlier settings took, so that small differences
-say nothing); errors are means over the captures ({captures}). *Pareto*: no other row of the table is both cheaper and
+say nothing); errors are means over the captures ({captures}), *range* is the lowest to the highest of all *runs*, which
+are those of all captures. *Pareto*: no other row of the table is both cheaper and
 better in the first error. Error is drawn over time, both logarithmic. What is swept, and against what, is declared in
 `tasks/cost/declared.py`. Machine: {machine}.
 """
@@ -77,8 +78,8 @@ def _table(rows: Sequence[Measurement], error: str) -> str:
         return "Not measured yet."
     front = {id(row) for row in pareto(rows, error)}
     names = [error, *(name for name in rows[0].errors if name != error)]
-    lines = [_line(["knob", "value", "CPU-s", "range", "MB", *(name.replace("_", " ") for name in names), ""])]
-    lines.append(_line(["---"] * (len(names) + 6)))
+    lines = [_line(["knob", "value", "CPU-s", "range", "runs", "MB", *(name.replace("_", " ") for name in names), ""])]
+    lines.append(_line(["---"] * (len(names) + 7)))
     for row in rows:
         figures = [_figure(row.errors.get(name)) for name in names]
         mark = "Pareto" if id(row) in front else ""
@@ -94,7 +95,7 @@ def _whole_table(rows: Sequence[Measurement]) -> str:
     fronts = {word: {id(row) for row in pareto(comparable, error)} for word, error in _FRONTS.items()}
     stages = [name for name in rows[0].parts if any(row.parts.get(name, 0) >= 0.5 for row in rows)]
     words = ["PSNR, dB", "novel view", "novel pose", "head", "SSIM", "perceptual"]
-    head = ["setting", "value", "CPU minutes", "range", *words, "MB", *stages, "Pareto"]
+    head = ["setting", "value", "CPU minutes", "range", "runs", *words, "MB", *stages, "Pareto"]
     lines = [_line(head), _line(["---"] * len(head))]
     for row in rows:
         scores = [f"{psnr(row.errors[name]):.2f}" for name in ("rmse", "view_rmse", "pose_rmse", "head_rmse")]
@@ -109,11 +110,12 @@ def _whole_table(rows: Sequence[Measurement]) -> str:
     return "\n".join(lines)
 
 
-def _time(spread: Spread | None, unit_s: float = 1.0) -> tuple[str, str]:
+def _time(spread: Spread | None, unit_s: float = 1.0) -> tuple[str, str, str]:
+    """Median, range, and how many runs they are of, those of all captures together."""
     if spread is None:
-        return "-", "-"
-    between = f"{spread.low / unit_s:.2f}-{spread.high / unit_s:.2f}" if spread.repeats > 1 else "once"
-    return f"{spread.median / unit_s:.2f}", between
+        return "-", "-", "0"
+    low, high = (f"{seconds / unit_s:.2f}" for seconds in (spread.low, spread.high))
+    return f"{spread.median / unit_s:.2f}", f"{low}-{high}" if spread.repeats > 1 else low, str(spread.repeats)
 
 
 def _whole(spread: Spread | None) -> str:
