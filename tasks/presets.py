@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from tasks.settings import Preset, Settings
 
 _BASE = Settings()
-STANDARD = _BASE.with_overrides(("perceive.iterations=30",))
+STANDARD = _BASE.with_overrides(("perceive.iterations=30", "perceive.passes=4"))
 
 PRESETS: Mapping[Preset, Settings] = {
     "draft": _BASE.with_overrides(

@@ -55,19 +55,32 @@ class MeasuredSet:
         return next((row for row in self.whole if dict(row.setting) == {knob: value}), None)
 
     def gains(self) -> dict[str, dict[Any, float]]:
-        """Knob -> value -> dB that it gains over the base (`tasks.cost.errors.gain`), everything else alike.
+        """Knob -> value -> dB that it gains over the base on the capture where it gains least (`tasks.cost.errors.gain`).
 
-        The base's own row is the preset's, measured without overrides or not at all.
+        Means would be chance: a third of the frames, or smaller ones, move single captures by .3 dB either way. The
+        base's own row is the preset's, measured without overrides or not at all; knobs that were not run on all of its
+        captures are left out.
         """
-        base = self.whole_row("preset", self.preset)
-        if base is None:
-            return {}
-        found: dict[str, dict[Any, float]] = {}
-        for row in self.whole:
-            (knob, value), *_ = row.setting.items()
-            if knob != "preset" and row.capture == base.capture:  # means over other captures say nothing
-                found.setdefault(knob, {})[value] = gain(row.errors, base.errors)
-        return found
+        base = {row.capture: row for row in self.rows if _setting_of_whole(row) == ("preset", self.preset)}
+        found: dict[str, dict[Any, dict[str, float]]] = {}
+        for row in self.rows:
+            knob, value = _setting_of_whole(row) or ("preset", None)
+            if knob != "preset" and row.capture in base:
+                by_capture = found.setdefault(knob, {}).setdefault(value, {})
+                by_capture[row.capture] = gain(row.errors, base[row.capture].errors)
+        least = {
+            knob: {value: min(gains.values()) for value, gains in values.items() if set(gains) == set(base)}
+            for knob, values in found.items()
+        }
+        return {knob: values for knob, values in least.items() if values}
+
+
+def _setting_of_whole(row: Measurement) -> tuple[str, Any] | None:
+    """What was set in a whole run that did not fail, else None."""
+    if row.failed or not of_sweep([row], END_TO_END):
+        return None
+    ((knob, value),) = row.setting.items()
+    return knob, value
 
 
 def _stage_times(rows: Sequence[Measurement]) -> Iterator[tuple[str, Knobs, float]]:

@@ -176,16 +176,19 @@ def test_both_fronts_of_whole_runs_are_marked(tmp_path: Path) -> None:
     assert marks == {"draft": "PSNR, perceptual", "standard": "perceptual", "high": ""}
 
 
-def test_a_gain_is_over_the_same_captures() -> None:
+def test_a_gain_is_the_least_over_all_captures_of_the_base() -> None:
     rows = (
         _whole("preset", "draft", 20.0, 60),
         _whole("preset", "draft", 22.0, 60, capture="b"),
         _whole("avatar.steps", 240, 20.5, 110),
     )
     found = MeasuredSet(rows, 0.03, {"cpu": "x"}, "draft", ())
-    assert found.gains() == {}, "half a decibel on the worse of two captures is no gain over the mean of both"
-    both = MeasuredSet((*rows, _whole("avatar.steps", 240, 22.1, 110, capture="b")), 0.03, {"cpu": "x"}, "draft", ())
-    assert both.gains()["avatar.steps"][240] == pytest.approx(0.3, abs=0.05)
+    assert found.gains() == {}, "half a decibel on the worse of two captures says nothing of the other"
+    for on_b, least in ((22.1, 0.1), (21.7, -0.3), (23.0, 0.5)):
+        both = replace(found, rows=(*rows, _whole("avatar.steps", 240, on_b, 110, capture="b")))
+        assert both.gains()["avatar.steps"][240] == pytest.approx(least), "what one capture gains, the other may lose"
+    failed = replace(_whole("avatar.steps", 240, 22.5, 110, capture="b"), failed="MemoryError")
+    assert replace(found, rows=(*rows, failed)).gains() == {}
 
 
 def test_a_prediction_knows_the_video_and_scales_with_the_machine(tmp_path: Path) -> None:
