@@ -55,7 +55,7 @@ class MeasuredSet:
         return next((row for row in self.whole if dict(row.setting) == {knob: value}), None)
 
     def gains(self) -> dict[str, dict[Any, float]]:
-        """Knob -> value -> dB that it gains over the base on the capture where it gains least (`tasks.cost.errors.gain`).
+        """Knob -> value -> dB over the base (`tasks.cost.errors.gain`) on the capture where it gains least.
 
         Means would be chance: a third of the frames, or smaller ones, move single captures by .3 dB either way. The
         base's own row is the preset's, measured without overrides or not at all; knobs that were not run on all of its
