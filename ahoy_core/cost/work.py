@@ -52,6 +52,10 @@ def _texture(k: Knobs) -> dict[str, float]:
     }
 
 
+def _complete(k: Knobs) -> dict[str, float]:
+    return {"texels": (k["texture.atlas_size"] / 256) ** 2, "once": 1.0}
+
+
 def _coarse(k: Knobs) -> dict[str, float]:
     steps, maps = k["coarse.steps"], (k["coarse.map_size"] / 128) ** 2
     return {
@@ -90,12 +94,13 @@ WORK: Mapping[str, Callable[[Knobs], dict[str, float]]] = {
     "ingest": _ingest,
     "perceive": _perceive,
     "texture": _texture,
+    "complete": _complete,
     "coarse": _coarse,
     "avatar": _avatar,
     "animate": _animate,
     "report": lambda k: {"once": 1.0},
 }
-"""Terms of each stage; stages that are not here ask the prior, and are not swept."""
+"""Terms of each stage; those that run only where the prior wins its self-check are not here."""
 
 KNOBS: tuple[str, ...] = (
     *(FRAMES, PIXELS),

@@ -16,6 +16,7 @@ from ahoy_core.ingest import IngestConfig
 from ahoy_core.ingest.run import select
 from tasks.cost.measured import MeasuredSet
 from tasks.presets import PRESETS
+from tasks.prior_folder import NONE
 from tasks.settings import Settings
 
 LEAST_GAIN_DB = 0.05  # smaller differences between single runs are noise
@@ -77,6 +78,8 @@ class Predictor:
     def by_stage(self, changes: Mapping[str, Any]) -> dict[str, float]:
         """Seconds of each stage that was measured."""
         seconds = self._times.all_seconds(self._knobs(changes))
+        if self._base.prior == NONE:
+            seconds.pop("complete", None)
         return {stage: self._factor * took for stage, took in seconds.items()}
 
     def seconds(self, changes: Mapping[str, Any]) -> float:

@@ -206,6 +206,14 @@ def test_a_prediction_knows_the_video_and_scales_with_the_machine(tmp_path: Path
     assert Predictor(found, base, long, 2.0).seconds({"ingest.max_frames": 16}) == pytest.approx(32, rel=0.01)
 
 
+def test_the_self_check_is_predicted_where_there_is_a_prior_to_check() -> None:
+    run = replace(_whole("preset", "draft", 20.0, 60), parts={"texture": 5.0, "complete": 15.0})
+    found = MeasuredSet((run,), 0.03, {"cpu": "x"}, "draft", ())
+    clip, without = Clip(np.arange(48) / 15, 256, 256), Settings().with_overrides(["prior=none"])
+    assert Predictor(found, Settings(), clip, 1.0).seconds({}) == pytest.approx(20, rel=0.01)
+    assert Predictor(found, without, clip, 1.0).seconds({}) == pytest.approx(5, rel=0.01)
+
+
 def test_rows_are_found_again_shared_between_sweeps_and_survive_a_torn_line(tmp_path: Path) -> None:
     row = Measurement("coarse.steps", {"steps": 60}, {"rmse": 20.0}, _once(5), _once(5), capture="a", made_of="h1")
     Rows(tmp_path).add(row)
