@@ -125,7 +125,7 @@ def _requests(request: Any, values: Mapping[str, Sequence[Any]]) -> dict[str, An
     found = {f"preset={name}": request.model_copy(update={"preset": name}) for name in values.get("preset", ())}
     for knob, choices in values.items():
         for value in () if knob == "preset" else choices:
-            change = f"{knob}={value}"
+            change = f"{knob}={value if isinstance(value, str) else json.dumps(value)}"  # false, not False
             found[change] = request.model_copy(update={"overrides": (*request.overrides, change)})
     return found
 
@@ -151,6 +151,7 @@ def _write(rows: Rows, out: Path, page: Path, measured: Path | None) -> list[Pat
     facts = json.loads((out / MACHINE).read_text(encoding="utf-8"))
     where = facts["machine"]
     said = {
+        "preset": facts["base"]["preset"],
         "base": f"preset {facts['base']['preset']}" + "".join(f", {one}" for one in facts["base"]["overrides"]),
         "machine": f"{where['cpu']}, {where['cores']} cores, {where['memory_gb']} GB, torch "
         f"{where['packages']['torch']}, one thread",

@@ -14,8 +14,8 @@ from typing import Any
 from ahoy_core.cost.sweep import Measurement, row_of
 from ahoy_core.cost.work import Knobs, TimeModel, fit_times
 from tasks.cost.declared import END_TO_END
-from tasks.cost.errors import gain, psnr
-from tasks.cost.summary import of_sweep, over_captures
+from tasks.cost.errors import psnr
+from tasks.cost.summary import least_gains, of_sweep, over_captures
 from tasks.presets import PRESETS
 from tasks.settings import Preset
 
@@ -55,32 +55,11 @@ class MeasuredSet:
         return next((row for row in self.whole if dict(row.setting) == {knob: value}), None)
 
     def gains(self) -> dict[str, dict[Any, float]]:
-        """Knob -> value -> dB over the base (`tasks.cost.errors.gain`) on the capture where it gains least.
+        """Knob -> value -> dB over the base on the capture where it gains least (`tasks.cost.summary.least_gains`).
 
-        Means would be chance: a third of the frames, or smaller ones, move single captures by .3 dB either way. The
-        base's own row is the preset's, measured without overrides or not at all; knobs that were not run on all of its
-        captures are left out.
+        The base's own row is the preset's, measured without overrides or not at all.
         """
-        base = {row.capture: row for row in self.rows if _setting_of_whole(row) == ("preset", self.preset)}
-        found: dict[str, dict[Any, dict[str, float]]] = {}
-        for row in self.rows:
-            knob, value = _setting_of_whole(row) or ("preset", None)
-            if knob != "preset" and row.capture in base:
-                by_capture = found.setdefault(knob, {}).setdefault(value, {})
-                by_capture[row.capture] = gain(row.errors, base[row.capture].errors)
-        least = {
-            knob: {value: min(gains.values()) for value, gains in values.items() if set(gains) == set(base)}
-            for knob, values in found.items()
-        }
-        return {knob: values for knob, values in least.items() if values}
-
-
-def _setting_of_whole(row: Measurement) -> tuple[str, Any] | None:
-    """What was set in a whole run that did not fail, else None."""
-    if row.failed or not of_sweep([row], END_TO_END):
-        return None
-    ((knob, value),) = row.setting.items()
-    return knob, value
+        return least_gains(self.rows, self.preset)
 
 
 def _stage_times(rows: Sequence[Measurement]) -> Iterator[tuple[str, Knobs, float]]:

@@ -8,9 +8,9 @@ from typing import Any
 
 from ahoy_core.cost.sweep import Measurement, Spread, pareto
 from tasks.cost.declared import END_TO_END, END_TO_END_REFERENCE, STAGE_SWEEPS
-from tasks.cost.errors import psnr
+from tasks.cost.errors import SHARPNESS_DB, psnr
 from tasks.cost.plots import draw
-from tasks.cost.summary import DRAWN, alike, of_sweep, omissions, over_captures, shown
+from tasks.cost.summary import DRAWN, alike, least_gains, of_sweep, omissions, over_captures, shown
 
 HEAD = """# What accuracy costs in time
 
@@ -30,7 +30,9 @@ better in the first error. Error is drawn over time, both logarithmic. What is s
 _FRONTS = {"PSNR": "rmse", "perceptual": "perceptual"}
 _WHOLE_WORDS = (
     "The columns of stages are their CPU seconds; SSIM and perceptual distance (less is better) are means of novel "
-    "views and novel poses. The last column says in which figures no other row is both cheaper and better."
+    "views and novel poses. *Least gain* is what a budget counts: dB over the base on the capture where that is least, "
+    f"a hundredth of perceptual distance taken as {SHARPNESS_DB / 100:.1f} dB; below zero the row is worse on one at "
+    "least, whatever the means say. The last column says in which figures no other row is both cheaper and better."
 )
 
 
@@ -39,7 +41,7 @@ def write_page(rows: Sequence[Measurement], facts: Mapping[str, Any], page: Path
 
     Args:
         rows: as measured, a row a capture.
-        facts: `base`, `machine`: what else the head says.
+        facts: `base`, `machine`: what else the head says; `preset`: of the base.
         page: where.
 
     Returns:
@@ -58,7 +60,9 @@ def write_page(rows: Sequence[Measurement], facts: Mapping[str, Any], page: Path
         if draw(alike(mine), error, unit, picture, minutes=name == END_TO_END):
             written.append(picture)
             parts.append(f"![{error.replace('_', ' ')} over CPU time]({picture.name})")
-        parts.append(_whole_table(mine) if name == END_TO_END else _table(mine, error))
+        parts.append(
+            _whole_table(mine, least_gains(rows, facts["preset"])) if name == END_TO_END else _table(mine, error)
+        )
     parts += ["## Omissions", "\n".join(f"- {line}" for line in omissions(rows))]
     page.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
     return written
@@ -88,14 +92,14 @@ def _table(rows: Sequence[Measurement], error: str) -> str:
     return "\n".join(lines)
 
 
-def _whole_table(rows: Sequence[Measurement]) -> str:
+def _whole_table(rows: Sequence[Measurement], gains: Mapping[str, Mapping[Any, float]]) -> str:
     if not rows:
         return "Not measured yet."
     comparable = alike(rows)
     fronts = {word: {id(row) for row in pareto(comparable, error)} for word, error in _FRONTS.items()}
     stages = [name for name in rows[0].parts if any(row.parts.get(name, 0) >= 0.5 for row in rows)]
     words = ["PSNR, dB", "novel view", "novel pose", "head", "SSIM", "perceptual"]
-    head = ["setting", "value", "CPU minutes", "range", "runs", *words, "MB", *stages, "Pareto"]
+    head = ["setting", "value", "CPU minutes", "range", "runs", "least gain", *words, "MB", *stages, "Pareto"]
     lines = [_line(head), _line(["---"] * len(head))]
     for row in rows:
         scores = [f"{psnr(row.errors[name]):.2f}" for name in ("rmse", "view_rmse", "pose_rmse", "head_rmse")]
@@ -104,7 +108,9 @@ def _whole_table(rows: Sequence[Measurement]) -> str:
         mark = ", ".join(word for word, front in fronts.items() if id(row) in front)
         seconds = [f"{row.parts.get(name, 0.0):.1f}" for name in stages]
         value = shown(row.setting) + ("" if row in comparable else f" ({row.capture} alone)")
-        cells = [row.sweep.partition(".")[2], value, *_time(row.cpu_s, 60), *scores, _whole(row.peak_mb), *seconds]
+        gained = gains.get(name := row.sweep.partition(".")[2], {}).get(next(iter(row.setting.values())))
+        least = "-" if gained is None else f"{gained:+.2f}"
+        cells = [name, value, *_time(row.cpu_s, 60), least, *scores, _whole(row.peak_mb), *seconds]
         lines.append(_line([*cells, mark]))
     lines += ["", _WHOLE_WORDS]
     return "\n".join(lines)

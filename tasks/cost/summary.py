@@ -9,6 +9,7 @@ from typing import Any
 
 from ahoy_core.cost.sweep import Measurement, Spread
 from tasks.cost.declared import END_TO_END, END_TO_END_KNOBS, NOT_SWEPT, STAGE_SWEEPS
+from tasks.cost.errors import gain
 from tasks.presets import PRESETS
 
 DRAWN = {END_TO_END: ("rmse", "levels of 255"), **{name: one.drawn for name, one in STAGE_SWEEPS.items()}}
@@ -59,6 +60,34 @@ def alike(rows: Sequence[Measurement]) -> list[Measurement]:
     """Rows over the captures that most were run on, as far as one row says: means over others do not compare."""
     most = max((row.capture for row in rows), key=lambda names: names.count(","), default="")
     return [row for row in rows if row.capture == most]
+
+
+def least_gains(rows: Sequence[Measurement], preset: str) -> dict[str, dict[Any, float]]:
+    """Knob of whole runs -> value -> dB over a preset (`tasks.cost.errors.gain`) on the capture where it gains least.
+
+    Means would be chance: a third of the frames, or smaller ones, move single captures by .3 dB either way. Knobs that
+    were not run on all of the preset's captures are left out.
+    """
+    base = {row.capture: row for row in rows if _set(row) == ("preset", preset)}
+    found: dict[str, dict[Any, dict[str, float]]] = {}
+    for row in rows:
+        knob, value = _set(row)
+        if knob and knob != "preset" and row.capture in base:
+            by_capture = found.setdefault(knob, {}).setdefault(value, {})
+            by_capture[row.capture] = gain(row.errors, base[row.capture].errors)
+    least = {
+        knob: {value: min(gains.values()) for value, gains in values.items() if set(gains) == set(base)}
+        for knob, values in found.items()
+    }
+    return {knob: values for knob, values in least.items() if values}
+
+
+def _set(row: Measurement) -> tuple[str, Any]:
+    """Knob and value of a whole run that did not fail; no knob for other rows."""
+    if row.failed or not of_sweep([row], END_TO_END):
+        return "", None
+    ((knob, value),) = row.setting.items()
+    return knob, value
 
 
 def of_sweep(rows: Sequence[Measurement], name: str) -> list[Measurement]:

@@ -168,7 +168,7 @@ def test_both_fronts_of_whole_runs_are_marked(tmp_path: Path) -> None:
         levels = {f"{kind}rmse": rmse(db) for kind in ("", "view_", "pose_", "head_")}
         errors = {**levels, "ssim_loss": 0.3, "perceptual": distance}
         rows.append(replace(_whole("preset", name, db, seconds), errors=errors))
-    write_page(rows, {"base": "preset draft", "machine": "this"}, tmp_path / "cost.md")
+    write_page(rows, {"preset": "draft", "base": "preset draft", "machine": "this"}, tmp_path / "cost.md")
     cells = [
         line.split(" | ") for line in (tmp_path / "cost.md").read_text().splitlines() if line.startswith("| preset")
     ]
