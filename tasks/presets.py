@@ -1,9 +1,11 @@
 """Three ways to spend time, picked from what was measured (docs/cost.md, end to end).
 
 What each costs and scores is its row `preset`, which `ahoy run` cites. `draft` is what knobs are changed around.
-`standard` takes what paid: maps of 256 (perceptual distance .166 for .179), 30 iterations of the fit (on capture a
-.03 dB and .005), an atlas of 512, eight hidden regions for the self-check; more steps than draft's, in either training,
-bought nothing. `high` has no row yet: its sizes are for larger pictures than the captures', where they gain nothing.
+`standard` takes what paid: maps of 256 (perceptual distance .166 for .179), 30 iterations of the fit and every frame in
+the texture (either gains on both captures), an atlas of 512; more steps than draft's bought nothing in either training.
+Four passes of the landmarks gain on both captures beside draft's knobs, but beside these the self-check of one then
+prefers the fill, and its pictures are .3 dB worse. `high` has sizes for larger pictures than the captures', where they
+gain nothing.
 """
 
 from __future__ import annotations
@@ -13,7 +15,7 @@ from collections.abc import Mapping
 from tasks.settings import Preset, Settings
 
 _BASE = Settings()
-STANDARD = _BASE.with_overrides(("perceive.iterations=30", "perceive.passes=4"))
+STANDARD = _BASE.with_overrides(("perceive.iterations=30",))
 
 PRESETS: Mapping[Preset, Settings] = {
     "draft": _BASE.with_overrides(
