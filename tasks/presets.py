@@ -5,7 +5,7 @@ What each costs and scores is its row `preset`, which `ahoy run` cites. `draft` 
 the texture (either gains on both captures), an atlas of 512; more steps than draft's bought nothing in either training.
 Four passes of the landmarks gain on both captures beside draft's knobs, but beside these the self-check of one then
 prefers the fill, and its pictures are .3 dB worse. `high` has sizes for larger pictures than the captures', where they
-gain nothing: on the one that it was run on .07 dB less than standard for 4.6 times the time, ST-LPIPS .152 for .153.
+gain nothing: on the one that it was run on .05 dB less than standard for 4.6 times the time, ST-LPIPS .152 for .153.
 """
 
 from __future__ import annotations
