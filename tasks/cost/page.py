@@ -22,9 +22,9 @@ missing stands under [omissions](#omissions).
 Each knob is changed alone, the others as the base settings say ({base}). Seconds are CPU seconds of the whole process,
 memory is the most that the process held while it ran (it keeps what earlier settings took, so that small differences
 say nothing); errors are means over the captures ({captures}), *range* is the lowest to the highest of all *runs*, which
-are those of all captures. *Pareto*: no other row of the table is both cheaper and
-better in the first error. Error is drawn over time, both logarithmic. What is swept, and against what, is declared in
-`tasks/cost/declared.py`. Machine: {machine}.
+are those of all captures. *Pareto*: no other row of the table is both cheaper and better in the first error. Error is
+drawn over time, both logarithmic. What is swept, and against what, is declared in `tasks/cost/declared.py`. Machine:
+{machine}.
 """
 
 _FRONTS = {"PSNR": "rmse", "perceptual": "perceptual"}
@@ -108,9 +108,10 @@ def _whole_table(rows: Sequence[Measurement], gains: Mapping[str, Mapping[Any, f
         mark = ", ".join(word for word, front in fronts.items() if id(row) in front)
         seconds = [f"{row.parts.get(name, 0.0):.1f}" for name in stages]
         value = shown(row.setting) + ("" if row in comparable else f" ({row.capture} alone)")
-        gained = gains.get(name := row.sweep.partition(".")[2], {}).get(next(iter(row.setting.values())))
+        ((knob, choice),) = row.setting.items()
+        gained = gains.get(knob, {}).get(choice)
         least = "-" if gained is None else f"{gained:+.2f}"
-        cells = [name, value, *_time(row.cpu_s, 60), least, *scores, _whole(row.peak_mb), *seconds]
+        cells = [knob, value, *_time(row.cpu_s, 60), least, *scores, _whole(row.peak_mb), *seconds]
         lines.append(_line([*cells, mark]))
     lines += ["", _WHOLE_WORDS]
     return "\n".join(lines)
