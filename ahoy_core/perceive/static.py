@@ -12,6 +12,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 MIN_FRAMES = 8  # fewer tell nothing about what is usual
 MAX_SAMPLES = 48  # frames that the statistics are taken from
@@ -19,7 +21,7 @@ SAME_COLOUR = 4.0  # of 255, after smoothing: what noise and compression leave
 SMOOTHING = 1.5  # pixels
 QUANTILE = 0.1
 STILL = 0.95  # share of the frames in which scenery looks as usual: people pass before it
-EDGE = 10.0  # of 255 a pixel: a patch ends at a steeper step of the usual picture
+EDGE = 10.0  # of 255 between neighbouring pixels: a patch ends at a larger step of the usual picture
 OUTSIDE = 64  # of 255: masks held below it hold no person
 MOVED = 0.5  # largest share of the person that may look as usual all the time
 MOSTLY = 0.5  # share of a patch that has to be outside
@@ -72,14 +74,27 @@ def scenery(usual: NDArray[np.float32], still: NDArray[np.bool_], outside: NDArr
     person = still[~outside]
     if not len(person) or person.mean() > MOVED:
         return np.zeros_like(still)
-    smooth = cv2.GaussianBlur(usual, (0, 0), 1.0)
-    steps = [cv2.Sobel(smooth, cv2.CV_32F, *axes, ksize=3, scale=1 / 8) for axes in ((1, 0), (0, 1))]
-    flat = still & (np.hypot(*steps).max(axis=-1) < EDGE)
-    count, patch = cv2.connectedComponents(flat.astype(np.uint8), connectivity=4)
-    size, away = (np.bincount(patch[part], minlength=count) for part in (flat, flat & outside))
-    found = (size > 0) & (away >= MOSTLY * size)
-    found[0] = False
-    return np.asarray(found[patch])
+    patch = _patches(usual, still)
+    size, away = (np.bincount(patch[part], minlength=int(patch.max()) + 1) for part in (still, still & outside))
+    return np.asarray(still & (away >= MOSTLY * np.maximum(size, 1))[patch])
+
+
+def _patches(usual: NDArray[np.float32], still: NDArray[np.bool_]) -> NDArray[np.int32]:
+    """Numbers [H,W] of patches: neighbouring pixels that never change and differ by less than an edge.
+
+    From pixel to pixel, with no smoothing: the rim of a shelf is a few pixels wide, and a derivative of a smoothed
+    picture sees nothing there but edges. The usual picture is a median over time and has little noise.
+    """
+    height, width = still.shape
+    number = np.arange(height * width, dtype=np.int32).reshape(height, width)
+    first, second = [], []
+    for here, there in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
+        linked = still[here] & still[there] & (np.abs(usual[here] - usual[there]).max(axis=-1) < EDGE)
+        first.append(number[here][linked])
+        second.append(number[there][linked])
+    links = np.concatenate(first), np.concatenate(second)
+    graph = coo_array((np.ones(len(links[0]), dtype=bool), links), shape=(number.size, number.size))
+    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int32).reshape(height, width)
 
 
 def _rim(usual: NDArray[np.float32], found: NDArray[np.bool_]) -> NDArray[np.bool_]:

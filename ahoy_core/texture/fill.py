@@ -22,12 +22,11 @@ import numpy as np
 
 from ahoy_core.texture.atlas import ObservedAtlas
 from ahoy_core.texture.diffusion import Pull, solve_links, vertex_links
-from ahoy_core.texture.light import estimate_light, shading
 from ahoy_core.texture.links import mirror_texels, texel_links
-from ahoy_core.texture.parts import find_parts
 from ahoy_core.texture.rays import BoolArray, FloatArray, IntArray
+from ahoy_core.texture.seen import at_vertices, nearest_vertex, read_seen
 from ahoy_core.texture.surface import Surface
-from ahoy_core.texture.texels import TexelMap, pad_charts, texel_normals
+from ahoy_core.texture.texels import TexelMap, pad_charts
 from ahoy_core.texture.tones import NEUTRAL_CLOTH, likely_colours, skin_tone
 
 FillKind = Literal["both", "harmonic", "symmetric"]
@@ -76,17 +75,9 @@ def fill_atlas(
             is known of it) and there is no step 3.
         light: copy colours without the light they were seen in, and light them where they come to lie.
     """
-    points = texels.points(vertices, surface.faces)
-    normals = texel_normals(texels, vertices, surface)
-    areas = texels.areas(vertices, surface)
-    seen = observed.coverage.ravel()[texels.flat] > 0
-    colours = observed.rgb.reshape(-1, 3)[texels.flat].astype(np.float64)
-    seen_value, seen_weight = _at_vertices(surface, texels, colours, seen)
-    parts = find_parts(surface, vertices, seen_value, seen_weight > 0)
-    part = parts.of_vertex[_nearest_vertex(surface, texels)]
-    slope = estimate_light(colours, normals, areas, part, seen) if light else np.zeros(3)
-    bright = shading(normals, slope)[:, None]
-    colours = colours / bright
+    told = read_seen(observed, surface, texels, vertices, light)
+    points, normals, areas, part = told.points, told.normals, told.areas, told.part
+    seen, colours = told.seen, told.colours
     opposite = np.full(len(seen), -1)
     if fill != "harmonic":
         opposite = _opposite(points, normals, areas, vertices, seen)
@@ -99,22 +90,22 @@ def fill_atlas(
             guess[own & ~known] = np.median(guess[own & known], axis=0) if (own & known).any() else NEUTRAL_CLOTH
         completed = guess
     else:
-        value, weight = _at_vertices(surface, texels, guess, known)
-        base = _vertex_fill(surface, texels, vertices, value, weight, skin, parts.of_vertex)
+        value, weight = at_vertices(surface, texels, guess, known)
+        base = _vertex_fill(surface, texels, vertices, value, weight, skin, told.parts.of_vertex)
         guess[~known] = base[~known]
         completed = _join(texels, points, normals, guess, colours, seen, known, part)
     rgb = np.zeros((texels.size * texels.size, 3), dtype=np.uint8)
-    rgb[texels.flat] = np.clip(np.rint(completed * bright), 0, 255).astype(np.uint8)
+    rgb[texels.flat] = np.clip(np.rint(completed * told.bright), 0, 255).astype(np.uint8)
     total = max(float(areas.sum()), 1e-12)
     return FilledAtlas(
         rgb=pad_charts(rgb.reshape(texels.size, texels.size, 3), texels.chart),
         mirrored=float(areas[known & ~seen].sum()) / total,
         diffused=float(areas[~known].sum()) / total,
         part=part.astype(np.uint8),
-        garments=parts.found,
+        garments=told.parts.found,
         skin=(int(skin[0]), int(skin[1]), int(skin[2])),
         skin_from=skin_from,
-        light=(float(slope[0]), float(slope[1]), float(slope[2])),
+        light=(float(told.slope[0]), float(told.slope[1]), float(told.slope[2])),
     )
 
 
@@ -127,23 +118,6 @@ def _opposite(
     sources, wanted = np.flatnonzero(seen), np.flatnonzero(~seen)
     opposite[wanted] = mirror_texels(points, normals, sources, wanted, middle, spacing)
     return opposite
-
-
-def _nearest_vertex(surface: Surface, texels: TexelMap) -> IntArray:
-    """[N] the corner that each texel is nearest to."""
-    nearest: IntArray = surface.faces[texels.face, texels.bary.argmax(axis=1)]
-    return nearest
-
-
-def _at_vertices(
-    surface: Surface, texels: TexelMap, colours: FloatArray, known: BoolArray
-) -> tuple[FloatArray, FloatArray]:
-    """Mean colours [V,3] of the known texels round each vertex, and how many they are [V]."""
-    count = len(surface.limb)
-    nearest = _nearest_vertex(surface, texels)[known]
-    weight = np.bincount(nearest, minlength=count)
-    sums = [np.bincount(nearest, colours[known, channel], count) for channel in range(3)]
-    return np.stack(sums, axis=1) / np.maximum(weight, 1)[:, None], weight
 
 
 def _vertex_fill(
@@ -166,7 +140,7 @@ def _vertex_fill(
     corners = surface.faces[texels.face]
     smooth = (value[corners] * texels.bary[:, :, None]).sum(axis=1)
     mixed = (part[corners] != part[corners][:, :1]).any(axis=1)
-    smooth[mixed] = value[_nearest_vertex(surface, texels)[mixed]]
+    smooth[mixed] = value[nearest_vertex(surface, texels)[mixed]]
     filled: FloatArray = smooth
     return filled
 

@@ -25,7 +25,8 @@ class TextureConfig(BaseModel):
     by which a frame is moved to agree with what is written (0: off). outlier_levels: colours further (of 255, in any
     channel) from what most frames show of a texel are not written (0: all are). fill: symmetry and harmonic filling
     ("both"), or one of them alone ("symmetric", "harmonic"). light: fill with colours freed of the light they were seen
-    in, and light them where they come to lie. canonical_height, canonical_width: pixels of the canonical
+    in, and light them where they come to lie. drop_stains: what lies at the edge of what was seen and is unlike its
+    garment (`ahoy_core.texture.stains`) counts as unseen. canonical_height, canonical_width: pixels of the canonical
     views. supersample: rays a pixel and axis in them.
     """
 
@@ -43,6 +44,7 @@ class TextureConfig(BaseModel):
     outlier_levels: float = Field(50.0, ge=0, le=255)
     fill: FillKind = "both"
     light: bool = True
+    drop_stains: bool = True
     canonical_height: int = Field(512, ge=16, le=4096)
     canonical_width: int = Field(384, ge=16, le=4096)
     supersample: int = Field(2, ge=1, le=8)

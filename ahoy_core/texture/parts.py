@@ -102,7 +102,7 @@ def best_cut(along: FloatArray, colours: FloatArray) -> float | None:
     if len(along) < 2 * LEAST_SIDE:
         return None
     order = np.argsort(along, kind="stable")
-    along, colours = along[order], _little_lightness(colours[order])
+    along, colours = along[order], little_lightness(colours[order])
     total = float(np.square(colours - colours.mean(axis=0)).sum())
     if total <= 0:
         return None
@@ -117,7 +117,7 @@ def best_cut(along: FloatArray, colours: FloatArray) -> float | None:
     return float(along[cuts[best] - 1 : cuts[best] + 1].mean())
 
 
-def _little_lightness(colours: FloatArray) -> FloatArray:
+def little_lightness(colours: FloatArray) -> FloatArray:
     """[N,3] CIE Lab colours of sRGB ones in 0..255, lightness counted less."""
     lab = cv2.cvtColor((colours[None] / 255).astype(np.float32), cv2.COLOR_RGB2Lab)[0].astype(np.float64)
     weighted: FloatArray = lab * (LIGHTNESS_WEIGHT, 1.0, 1.0)

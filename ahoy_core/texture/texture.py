@@ -17,6 +17,8 @@ from ahoy_core.texture.canonical import canonical_views
 from ahoy_core.texture.fill import FilledAtlas, fill_atlas
 from ahoy_core.texture.inputs import TextureConfig, check_inputs, choose_frames
 from ahoy_core.texture.rays import BoolArray, FloatArray, IntArray
+from ahoy_core.texture.seen import read_seen
+from ahoy_core.texture.stains import without_stains
 from ahoy_core.texture.surface import Surface
 from ahoy_core.texture.texels import TexelMap, texel_map
 
@@ -94,6 +96,10 @@ def build_texture(
     points = texels.points(vertices, surface.faces)
     clip = Clip(frames, visible, fit, body, surface, config, second)
     observed, log = accumulate(clip, texels, points, chosen, progress)
+    stained = 0.0
+    if config.drop_stains:
+        told = read_seen(observed, surface, texels, vertices, config.light)
+        observed, stained = without_stains(observed, told, surface, texels)
     filled = fill_atlas(observed, surface, texels, vertices, config.fill, config.light)
     rendered = canonical_views(
         surface,
@@ -116,7 +122,7 @@ def build_texture(
         partial=rendered.partial,
         viewmats=rendered.cameras.viewmats.numpy().astype(np.float32),
         Ks=rendered.cameras.Ks.numpy().astype(np.float32),
-        notes=_notes(observed, filled, surface, texels, vertices, chosen, rejected, log, config),
+        notes=_notes(observed, filled, surface, texels, vertices, chosen, rejected, log, config, stained),
     )
 
 
@@ -147,12 +153,14 @@ def _notes(
     rejected: dict[str, list[int]],
     log: Log,
     config: TextureConfig,
+    stained: float,
 ) -> dict[str, Any]:
     """What texture.json says."""
     areas = texels.areas(vertices, surface)
     seen = observed.coverage.ravel()[texels.flat] > 0
     return {
         "observed_share": float(areas[seen].sum() / max(areas.sum(), 1e-12)),
+        "stained_share": round(stained, 4),
         "mirrored_share": filled.mirrored,
         "diffused_share": filled.diffused,
         "fill": FILL_WORDS[config.fill],

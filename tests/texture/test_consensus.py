@@ -17,7 +17,9 @@ def test_a_ball_that_the_mask_took_for_the_person_leaves_no_colour(body: Capsule
     fit = standing(5)
     frames, masks = pictures(body, fit, lambda points: np.full((len(points), 3), 60.0))
     frames[when, 50:70, 56:72] = 255
-    config = TextureConfig(atlas_size=64, canonical_height=32, canonical_width=24, align_px=0, rule="first")
+    config = TextureConfig(
+        atlas_size=64, canonical_height=32, canonical_width=24, align_px=0, rule="first", drop_stains=False
+    )
     clean, naive = (
         build_texture(
             frames,
