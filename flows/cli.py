@@ -29,6 +29,7 @@ from flows.bad_input import bad_input_said
 from storage_schema.secrets import RedactSecrets
 
 if TYPE_CHECKING:
+    from flows.pipeline import Call
     from flows.request import VideoRequest
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
@@ -112,14 +113,15 @@ def run(
                     "overrides": tuple(set_ or ()),
                 }
             )
+            call: Call | None = None
             if budget is not None:
-                request = _within(request, budget, preset, console)
+                request, call = _within(request, budget, preset, console)
             elif not list_subjects:
                 console.print(_cited(request.preset), soft_wrap=True, highlight=False)
             if list_subjects:
                 paths = _list_here(request, console)
             else:
-                paths = _run_flow(request) if prefect else _run_here(request, console)
+                paths = _run_flow(request) if prefect else _run_here(request, console, call)
     except KeyboardInterrupt:
         console.print("interrupted; finished stages are kept, the same command goes on from there")
         raise typer.Exit(EXIT_INTERRUPTED) from None
@@ -133,22 +135,26 @@ def _cited(preset: str) -> str:
     return cited(preset, packaged_set())
 
 
-def _within(request: VideoRequest, budget: str, preset: str | None, console: Console) -> VideoRequest:
-    """The request with the knobs that a budget buys."""
+def _within(request: VideoRequest, budget: str, preset: str | None, console: Console) -> tuple[VideoRequest, Call]:
+    """The request with the knobs that a budget buys, and how to call its stages so that it is kept."""
     from flows.budget import budgeted
     from flows.duration import seconds_of
 
     if preset is not None:
         raise ValueError(f"expected --preset or --budget, got both ({preset}, {budget}): a budget chooses the knobs")
-    chosen = budgeted(request, seconds_of(budget, "3m"))
-    for line in chosen.said:
+
+    def told(line: str) -> None:
         console.print(line, soft_wrap=True, highlight=False)
-    return request.model_copy(update={"preset": chosen.preset, "overrides": chosen.overrides})
+
+    chosen, call = budgeted(request, seconds_of(budget, "3m"), told=told)
+    for line in chosen.said:
+        told(line)
+    return request.model_copy(update={"preset": chosen.preset, "overrides": chosen.overrides}), call
 
 
-def _run_here(request: VideoRequest, console: Console) -> dict[str, Path]:
+def _run_here(request: VideoRequest, console: Console, call: Call | None) -> dict[str, Path]:
     from flows.deliver import deliver
-    from flows.pipeline import process
+    from flows.pipeline import call_directly, process
     from flows.subjects import each_subject
     from flows.terminal import TerminalObserver
 
@@ -158,7 +164,9 @@ def _run_here(request: VideoRequest, console: Console) -> dict[str, Path]:
     with TerminalObserver(console) as observer:
         attempt = request.run(request.id_of(source), observer)
         for prefix, chosen, run in each_subject(request.subject, source, settings, attempt):
-            outcome = process(source, chosen, run, only=request.stages)
+            # A budget is kept for one avatar; of several, each is made with the knobs of the first choice.
+            steered = call if call and request.subject != "all" else call_directly
+            outcome = process(source, chosen, run, only=request.stages, call=steered)
             for stage, reason in outcome.skipped.items():
                 console.print(f"{stage:<10} skipped: {reason}")
             made = deliver(outcome, run, request.out) if request.out else {}

@@ -25,6 +25,7 @@ from flows.evaluate import Subject, stages_up_to
 from flows.evaluate_request import EvaluateRequest
 from flows.pipeline import call_directly, process
 from storage_schema.store import ArtifactStore
+from tasks.cost.change import Change
 from tasks.cost.declared import StageSweep
 from tasks.cost.errors import whole_errors
 from tasks.cost.predict import ingested, work_knobs
@@ -162,7 +163,9 @@ def _inputs(base: Base, declared: StageSweep, run: Run) -> dict[str, StageRef]:
     return {name: made.refs[name] for name in needs}
 
 
-def whole_rows(base: Base, settings: Mapping[str, EvaluateRequest], repeats: int, rows: Rows, told: Told) -> None:
+def whole_rows(
+    base: Base, wanted: Sequence[tuple[Change, EvaluateRequest]], around: str, repeats: int, rows: Rows, told: Told
+) -> None:
     """Whole runs on one capture, each scored against the truth.
 
     A run's seconds are the bills of its stages, those that another run of this sweep left in the store too. Every
@@ -170,25 +173,26 @@ def whole_rows(base: Base, settings: Mapping[str, EvaluateRequest], repeats: int
 
     Args:
         base: the capture.
-        settings: by what is said of the row (`preset=draft`, `avatar.steps=60`), the request that it stands for.
+        wanted: what each row changes, and the request that it stands for.
+        around: preset that rows are round unless they name another.
         repeats: runs of every setting; they make the same avatar, so the first is scored.
         rows: where rows are kept.
         told: called with a line on each run.
     """
     again = Path(base.request.out) / "repeats"
     stores = [base.store, *(ArtifactStore(again / str(number)) for number in range(2, repeats + 1))]
-    for said, request in settings.items():
+    for change, request in wanted:
         subjects = [replace(base, request=request, store=store).subject for store in stores]
         subject = subjects[0]
         chosen = subject.settings("full")
         versions = {stage.name: stage.version for stage in STAGES}
         asked = _prior(subject.run())
         made_of = _hash([chosen.model_dump(mode="json"), versions, asked, subject.truth.content_hash, request.size])
-        knob, _, value = said.partition("=")
-        if rows.reuse(made_of, f"end-to-end.{knob}", {knob: _plain(value)}, repeats):
+        name, setting = change.sweep(around), change.setting(around)
+        if rows.reuse(made_of, name, setting, repeats):
             continue
-        told(f"{base.capture.name}, end to end: {said}")
-        row = Measurement(f"end-to-end.{knob}", {knob: _plain(value)}, capture=base.capture.name, made_of=made_of)
+        told(f"{base.capture.name}, end to end: {', '.join(f'{knob}={value}' for knob, value in setting.items())}")
+        row = Measurement(name, setting, capture=base.capture.name, made_of=made_of)
         try:
             rows.add(_whole(row, subjects))
         except Exception as problem:  # a run that fails is a finding about that setting
@@ -230,13 +234,6 @@ def _folder(store: ArtifactStore, ref: StageRef) -> Path:
     manifest = store.lookup(ref.key, stage=ref.stage, verify=False)
     assert manifest is not None  # it was made or found a moment ago
     return store.fetch(manifest)
-
-
-def _plain(text: str) -> Any:
-    try:
-        return json.loads(text)
-    except json.JSONDecodeError:
-        return text
 
 
 def _hash(value: Any) -> str:

@@ -47,13 +47,14 @@ def cost(
     import torch
 
     from flows.terminal import TerminalObserver
+    from tasks.cost.declared import END_TO_END
     from tasks.cost.rows import Rows
 
     with bad_input_said(console):
         torch.set_num_threads(threads)
         rows = Rows(out)
         if dataset is not None:
-            wanted = _wanted(stages or [], knob or [], [name for name in presets.split(",") if name])
+            wanted = _wanted(stages or [], knob or [], [name for name in presets.split(",") if name], preset)
             fields: dict[str, Any] = {
                 "dataset": dataset,
                 "out": str(out),
@@ -62,19 +63,22 @@ def cost(
                 "size": size,
             }
             fields |= {"only": tuple(only.split(",")) if only else (), "overrides": tuple(set_ or ())}
-            _note_machine(out / MACHINE, preset, set_ or [])
+            around = _note_machine(out / MACHINE, preset, set_ or [], whole_runs_alone=set(wanted) == {END_TO_END})
             with TerminalObserver(console) as observer:
-                _measure(fields, wanted, repeats, rows, observer)
+                _measure(fields, wanted, around, repeats, rows, observer)
         for path in _write(rows, out, page or out / PAGE, measured):
             console.print(str(path), soft_wrap=True, highlight=False)
 
 
-def _wanted(stages: Sequence[str], knobs: Sequence[str], presets: Sequence[str]) -> dict[str, dict[str, Sequence[Any]]]:
+def _wanted(
+    stages: Sequence[str], knobs: Sequence[str], presets: Sequence[str], preset: str
+) -> dict[str, dict[str, Sequence[Any]]]:
     """What was swept -> knob -> values."""
     from tasks.cost.declared import END_TO_END, END_TO_END_KNOBS, STAGE_SWEEPS
 
     declared: dict[str, dict[str, Sequence[Any]]] = {name: dict(one.knobs) for name, one in STAGE_SWEEPS.items()}
-    declared[END_TO_END] = {"preset": presets, **END_TO_END_KNOBS}
+    round_it = next((knobs_of for name, knobs_of in END_TO_END_KNOBS.items() if name == preset), {})
+    declared[END_TO_END] = {"preset": presets, **round_it}
     if unknown := sorted(set(stages) - set(declared)):
         raise ValueError(f"expected stages among {', '.join(declared)}, got {', '.join(unknown)}")
     chosen = {name: knobs_of for name, knobs_of in declared.items() if not stages or name in stages}
@@ -98,6 +102,7 @@ def _wanted(stages: Sequence[str], knobs: Sequence[str], presets: Sequence[str])
 def _measure(
     fields: Mapping[str, Any],
     wanted: Mapping[str, Mapping[str, Sequence[Any]]],
+    around: str,
     repeats: int,
     rows: Rows,
     observer: Observer,
@@ -115,30 +120,50 @@ def _measure(
         base = Base(request, capture, artifacts, observer)
         for name, values in wanted.items():
             if name == END_TO_END:
-                whole_rows(base, _requests(request, values), repeats, rows, told)
+                whole_rows(base, _requests(request, values, around), around, repeats, rows, told)
             else:
                 stage_rows(base, STAGE_SWEEPS[name], values, repeats, rows, told)
 
 
-def _requests(request: Any, values: Mapping[str, Sequence[Any]]) -> dict[str, Any]:
-    """A request for every preset and every single change of the base."""
-    found = {f"preset={name}": request.model_copy(update={"preset": name}) for name in values.get("preset", ())}
+def _requests(request: Any, values: Mapping[str, Sequence[Any]], around: str) -> list[tuple[Any, Any]]:
+    """Every preset and every single change of the base, each with the request that it stands for."""
+    from tasks.cost.change import PRESET, Change
+
+    found = []
     for knob, choices in values.items():
-        for value in () if knob == "preset" else choices:
-            change = f"{knob}={value if isinstance(value, str) else json.dumps(value)}"  # false, not False
-            found[change] = request.model_copy(update={"overrides": (*request.overrides, change)})
+        for value in choices:
+            if knob == PRESET:
+                found.append((Change(around, PRESET, value), request.model_copy(update={"preset": value})))
+                continue
+            text = f"{knob}={value if isinstance(value, str) else json.dumps(value)}"  # false, not False
+            changed = request.model_copy(update={"overrides": (*request.overrides, text)})
+            found.append((Change(request.preset, knob, value), changed))
     return found
 
 
-def _note_machine(path: Path, preset: str, overrides: Sequence[str]) -> None:
-    """Say what the rows are measured on; the fastest unit of several calls counts."""
+def _note_machine(path: Path, preset: str, overrides: Sequence[str], whole_runs_alone: bool) -> str:
+    """Say what the rows are measured on; the fastest unit of several calls counts.
+
+    Returns:
+        The preset that the rows of this folder are round unless they name another: that of the first sweep.
+
+    Raises:
+        ValueError: rows of one folder would not be round the same settings, and not say so.
+    """
     from ahoy_core.cost.machine import machine
     from ahoy_core.cost.pace import measure_pace
 
     before = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
     unit = min(measure_pace().cpu_s, before.get("unit_cpu_s", float("inf")))
-    base = {"preset": preset, "overrides": list(overrides)}
+    base = before.get("base", {"preset": preset, "overrides": list(overrides)})
+    if list(overrides) != base["overrides"] or (preset != base["preset"] and not whole_runs_alone):
+        raise ValueError(
+            f"expected sweeps round preset {base['preset']} with {base['overrides'] or 'no overrides'}, as the rows in "
+            f"{path.parent} are (end-to-end alone may be round another preset), got {preset} with {list(overrides)}; "
+            "take another --out"
+        )
     path.write_text(json.dumps({"machine": machine(), "unit_cpu_s": unit, "base": base}, indent=1), encoding="utf-8")
+    return str(base["preset"])
 
 
 def _write(rows: Rows, out: Path, page: Path, measured: Path | None) -> list[Path]:

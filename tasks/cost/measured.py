@@ -13,6 +13,7 @@ from typing import Any
 
 from ahoy_core.cost.sweep import Measurement, row_of
 from ahoy_core.cost.work import Knobs, TimeModel, fit_times
+from tasks.cost.change import PRESET
 from tasks.cost.declared import END_TO_END
 from tasks.cost.errors import psnr
 from tasks.cost.summary import least_gains, of_sweep, over_captures
@@ -54,12 +55,18 @@ class MeasuredSet:
         """The whole run at `knob=value`, or at `preset=NAME`."""
         return next((row for row in self.whole if dict(row.setting) == {knob: value}), None)
 
-    def gains(self) -> dict[str, dict[Any, float]]:
-        """Knob -> value -> dB over the base on the capture where it gains least (`tasks.cost.summary.least_gains`).
+    def gains(self, preset: Preset | None = None) -> dict[str, dict[Any, float]]:
+        """Knob -> value -> dB over a preset on the capture where it gains least (`tasks.cost.summary.least_gains`).
 
-        The base's own row is the preset's, measured without overrides or not at all.
+        Args:
+            preset: of `rounds`; the base by default. Its own row was measured without overrides or not at all.
         """
-        return least_gains(self.rows, self.preset)
+        known = least_gains(self.rows, self.preset, preset)
+        return {knob: values for knob, values in known.items() if knob != PRESET}
+
+    def rounds(self) -> dict[Preset, float]:
+        """Presets that were run whole on all of the base's captures -> dB over it where they gain least."""
+        return dict(least_gains(self.rows, self.preset).get(PRESET, {}))
 
 
 def _stage_times(rows: Sequence[Measurement]) -> Iterator[tuple[str, Knobs, float]]:

@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from ahoy_core.cost.sweep import Measurement, Spread, pareto
-from tasks.cost.declared import END_TO_END, END_TO_END_REFERENCE, STAGE_SWEEPS
+from tasks.cost.change import Change
+from tasks.cost.declared import END_TO_END, END_TO_END_KNOBS, END_TO_END_REFERENCE, STAGE_SWEEPS
 from tasks.cost.errors import SHARPNESS_DB, psnr
 from tasks.cost.plots import draw
 from tasks.cost.summary import DRAWN, alike, least_gains, of_sweep, omissions, over_captures, shown
@@ -30,9 +31,10 @@ drawn over time, both logarithmic. What is swept, and against what, is declared 
 _FRONTS = {"PSNR": "rmse", "perceptual": "perceptual"}
 _WHOLE_WORDS = (
     "The columns of stages are their CPU seconds; SSIM and perceptual distance (less is better) are means of novel "
-    "views and novel poses. *Least gain* is what a budget counts: dB over the base on the capture where that is least, "
-    f"a hundredth of perceptual distance taken as {SHARPNESS_DB / 100:.1f} dB; below zero the row is worse on one at "
-    "least, whatever the means say. The last column says in which figures no other row is both cheaper and better."
+    "views and novel poses. *Least gain* is what a budget counts: dB over the base (or the preset that is named) on "
+    f"the capture where that is least, a hundredth of perceptual distance taken as {SHARPNESS_DB / 100:.1f} dB; below "
+    "zero the row is worse on one at least, whatever the means say. The last column says in which figures no other row "
+    "is both cheaper and better."
 )
 
 
@@ -60,10 +62,8 @@ def write_page(rows: Sequence[Measurement], facts: Mapping[str, Any], page: Path
         if draw(alike(mine), error, unit, picture, minutes=name == END_TO_END):
             written.append(picture)
             parts.append(f"![{error.replace('_', ' ')} over CPU time]({picture.name})")
-        parts.append(
-            _whole_table(mine, least_gains(rows, facts["preset"])) if name == END_TO_END else _table(mine, error)
-        )
-    parts += ["## Omissions", "\n".join(f"- {line}" for line in omissions(rows))]
+        parts.append(_whole_table(mine, rows, facts["preset"]) if name == END_TO_END else _table(mine, error))
+    parts += ["## Omissions", "\n".join(f"- {line}" for line in omissions(rows, facts["preset"]))]
     page.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
     return written
 
@@ -92,9 +92,17 @@ def _table(rows: Sequence[Measurement], error: str) -> str:
     return "\n".join(lines)
 
 
-def _whole_table(rows: Sequence[Measurement], gains: Mapping[str, Mapping[Any, float]]) -> str:
+def _whole_table(rows: Sequence[Measurement], measured: Sequence[Measurement], base: str) -> str:
+    """The table of whole runs.
+
+    Args:
+        rows: means over captures.
+        measured: a row a capture.
+        base: preset that rows are round unless they name another.
+    """
     if not rows:
         return "Not measured yet."
+    gains = {name: least_gains(measured, base, name) for name in (base, *END_TO_END_KNOBS)}
     comparable = alike(rows)
     fronts = {word: {id(row) for row in pareto(comparable, error)} for word, error in _FRONTS.items()}
     stages = [name for name in rows[0].parts if any(row.parts.get(name, 0) >= 0.5 for row in rows)]
@@ -108,10 +116,11 @@ def _whole_table(rows: Sequence[Measurement], gains: Mapping[str, Mapping[Any, f
         mark = ", ".join(word for word, front in fronts.items() if id(row) in front)
         seconds = [f"{row.parts.get(name, 0.0):.1f}" for name in stages]
         value = shown(row.setting) + ("" if row in comparable else f" ({row.capture} alone)")
-        ((knob, choice),) = row.setting.items()
-        gained = gains.get(knob, {}).get(choice)
+        change = Change.of(row.setting, base)
+        gained = gains.get(change.preset, {}).get(change.knob, {}).get(change.value)
         least = "-" if gained is None else f"{gained:+.2f}"
-        cells = [knob, value, *_time(row.cpu_s, 60), least, *scores, _whole(row.peak_mb), *seconds]
+        said = row.sweep.partition(".")[2].replace(f"{change.preset}.", f"{change.preset}: ", 1)
+        cells = [said, value, *_time(row.cpu_s, 60), least, *scores, _whole(row.peak_mb), *seconds]
         lines.append(_line([*cells, mark]))
     lines += ["", _WHOLE_WORDS]
     return "\n".join(lines)

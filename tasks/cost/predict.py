@@ -17,7 +17,7 @@ from ahoy_core.ingest.run import select
 from tasks.cost.measured import MeasuredSet
 from tasks.presets import PRESETS
 from tasks.prior_folder import NONE
-from tasks.settings import Settings
+from tasks.settings import Preset, Settings
 
 LEAST_GAIN_DB = 0.05  # smaller differences between single runs are noise
 
@@ -70,14 +70,18 @@ class Predictor:
     """
 
     def __init__(self, measured: MeasuredSet, base: Settings, clip: Clip, factor: float) -> None:
-        self._times, self._base, self._clip, self._factor = measured.times, base, clip, factor
+        self._measured, self._base, self._clip, self._factor = measured, base, clip, factor
         self._at_base = work_knobs(base, {FRAMES: 0, PIXELS: 0})
         self._known: dict[tuple[Any, ...], float] = {}
         self._given: dict[str, dict[str, int]] = {}
 
+    def at(self, factor: float) -> Predictor:
+        """The same on a machine of another pace."""
+        return Predictor(self._measured, self._base, self._clip, factor)
+
     def by_stage(self, changes: Mapping[str, Any]) -> dict[str, float]:
         """Seconds of each stage that was measured."""
-        seconds = self._times.all_seconds(self._knobs(changes))
+        seconds = self._measured.times.all_seconds(self._knobs(changes))
         if self._base.prior == NONE:
             seconds.pop("complete", None)
         return {stage: self._factor * took for stage, took in seconds.items()}
@@ -96,11 +100,18 @@ class Predictor:
         return {**self._at_base, **clip, **{name: value for name, value in changes.items() if name in KNOBS}}
 
 
-def gains_of(measured: MeasuredSet, fixed: Sequence[str] = ()) -> Gains:
-    """What single knobs gain over the set's base, in dB, sharpness counted; those that are fixed are left out."""
-    settings = PRESETS[measured.preset].with_overrides(measured.overrides).model_dump(mode="json")
+def gains_of(measured: MeasuredSet, fixed: Sequence[str] = (), preset: Preset | None = None) -> Gains:
+    """What single knobs gain over a preset, in dB, sharpness counted.
+
+    Args:
+        measured: the set.
+        fixed: knobs that are left out.
+        preset: that they were swept round; the set's base by default.
+    """
+    preset = preset or measured.preset
+    settings = PRESETS[preset].with_overrides(measured.overrides).model_dump(mode="json")
     by_knob, base = {}, {}
-    for knob, values in measured.gains().items():
+    for knob, values in measured.gains(preset).items():
         if knob in fixed:
             continue
         group, _, name = knob.partition(".")

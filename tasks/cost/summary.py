@@ -8,9 +8,11 @@ from dataclasses import replace
 from typing import Any
 
 from ahoy_core.cost.sweep import Measurement, Spread
+from tasks.cost.change import PRESET, Change
 from tasks.cost.declared import END_TO_END, END_TO_END_KNOBS, NOT_SWEPT, STAGE_SWEEPS
 from tasks.cost.errors import gain
 from tasks.presets import PRESETS
+from tasks.settings import Preset
 
 DRAWN = {END_TO_END: ("rmse", "levels of 255"), **{name: one.drawn for name, one in STAGE_SWEEPS.items()}}
 """The error that is drawn, and its unit, by what was swept."""
@@ -62,32 +64,31 @@ def alike(rows: Sequence[Measurement]) -> list[Measurement]:
     return [row for row in rows if row.capture == most]
 
 
-def least_gains(rows: Sequence[Measurement], preset: str) -> dict[str, dict[Any, float]]:
+def least_gains(rows: Sequence[Measurement], base: str, preset: str | None = None) -> dict[str, dict[Any, float]]:
     """Knob of whole runs -> value -> dB over a preset (`tasks.cost.errors.gain`) on the capture where it gains least.
 
     Means would be chance: a third of the frames, or smaller ones, move single captures by .3 dB either way. Knobs that
     were not run on all of the preset's captures are left out.
+
+    Args:
+        rows: of the set.
+        base: preset that rows are round unless they name another.
+        preset: the one that is gained over; the base by default, which the other presets (knob `preset`) are compared
+            with too.
     """
-    base = {row.capture: row for row in rows if _set(row) == ("preset", preset)}
+    preset = preset or base
+    whole = [(row, Change.of(row.setting, base)) for row in of_sweep(rows, END_TO_END) if not row.failed]
+    over = {row.capture: row for row, change in whole if change == Change(base, PRESET, preset)}
     found: dict[str, dict[Any, dict[str, float]]] = {}
-    for row in rows:
-        knob, value = _set(row)
-        if knob and knob != "preset" and row.capture in base:
-            by_capture = found.setdefault(knob, {}).setdefault(value, {})
-            by_capture[row.capture] = gain(row.errors, base[row.capture].errors)
+    for row, change in whole:
+        if change.preset == preset and row.capture in over:
+            by_capture = found.setdefault(change.knob, {}).setdefault(change.value, {})
+            by_capture[row.capture] = gain(row.errors, over[row.capture].errors)
     least = {
-        knob: {value: min(gains.values()) for value, gains in values.items() if set(gains) == set(base)}
+        knob: {value: min(gains.values()) for value, gains in values.items() if set(gains) == set(over)}
         for knob, values in found.items()
     }
     return {knob: values for knob, values in least.items() if values}
-
-
-def _set(row: Measurement) -> tuple[str, Any]:
-    """Knob and value of a whole run that did not fail; no knob for other rows."""
-    if row.failed or not of_sweep([row], END_TO_END):
-        return "", None
-    ((knob, value),) = row.setting.items()
-    return knob, value
 
 
 def of_sweep(rows: Sequence[Measurement], name: str) -> list[Measurement]:
@@ -95,8 +96,13 @@ def of_sweep(rows: Sequence[Measurement], name: str) -> list[Measurement]:
     return [row for row in rows if row.sweep.partition(".")[0] == name]
 
 
-def omissions(rows: Sequence[Measurement]) -> list[str]:
-    """What failed and why, and what was declared and has no row."""
+def omissions(rows: Sequence[Measurement], base: Preset) -> list[str]:
+    """What failed and why, and what was declared and has no row.
+
+    Args:
+        rows: of the set.
+        base: preset that rows are round unless they name another.
+    """
     found = [
         f"{row.sweep} = {shown(row.setting)}, capture {row.capture}: {row.failed.splitlines()[0]}"
         for row in rows
@@ -104,7 +110,8 @@ def omissions(rows: Sequence[Measurement]) -> list[str]:
     ]
     there = {(row.sweep, shown(row.setting)) for row in rows}
     declared: dict[str, Mapping[str, Sequence[Any]]] = {name: one.knobs for name, one in STAGE_SWEEPS.items()}
-    declared[END_TO_END] = {"preset": tuple(PRESETS), **END_TO_END_KNOBS}
+    declared[END_TO_END] = {PRESET: tuple(PRESETS), **END_TO_END_KNOBS[base]}
+    declared |= {f"{END_TO_END}.{name}": knobs for name, knobs in END_TO_END_KNOBS.items() if name != base}
     for stage, knobs in declared.items():
         for knob, values in knobs.items():
             sweep = f"{stage}.{knob}"
@@ -117,5 +124,6 @@ def omissions(rows: Sequence[Measurement]) -> list[str]:
 
 
 def shown(setting: Mapping[str, Any]) -> str:
-    """A setting's value as the tables say it."""
-    return ", ".join(str(value) for value in setting.values())
+    """A setting's value as the tables say it; the preset that a whole run is round stands before it, in its sweep."""
+    knobs = {knob: value for knob, value in setting.items() if knob != PRESET}
+    return ", ".join(str(value) for value in (knobs or setting).values())

@@ -244,9 +244,10 @@ def test_captures_are_averaged_and_what_is_missing_is_an_omission() -> None:
     (mean,) = over_captures([*rows, failed])
     assert mean.cpu_s is not None and mean.cpu_s.median == 70 and mean.capture == "a, b"
     assert psnr(mean.errors["rmse"]) == pytest.approx(21, abs=0.1)
-    said = omissions([*rows, failed])
+    said = omissions([*rows, failed], "draft")
     assert "end-to-end.preset = high, capture a: MemoryError: none" in said
     assert "end-to-end.preset = standard: not measured yet" in said and "texture.rule: not measured yet" in said
+    assert "end-to-end.standard.avatar.steps: not measured yet" in said
     assert any(line.startswith("hallucinate: no sweep of its own") for line in said)
 
 
