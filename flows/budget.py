@@ -101,7 +101,8 @@ def budgeted(
     # A run's stages are measured in CPU seconds of one thread; what they take here is what the unit takes here.
     factor = measure_pace().wall_s / measured.unit_cpu_s
     clip = Clip.of(source.path)
-    best = max((_round(p, request, fixed, measured, clip, factor, budget_s) for p in measured.rounds()), key=_worth)
+    bought = [_round(preset, request, fixed, measured, clip, factor, budget_s) for preset in measured.rounds()]
+    best = max(bought, key=lambda one: one.worth)
 
     def budget_of(changes: Mapping[str, Any]) -> Budget:
         overrides = (*measured.overrides, *overrides_of(changes), *request.overrides)
@@ -133,10 +134,6 @@ def _round(
     predictor = Predictor(measured, settings, clip, factor)
     choice = choose(gains_of(measured, fixed, preset), predictor.seconds, budget_s, STEPS)
     return Found(preset, measured.rounds()[preset], choice, predictor)
-
-
-def _worth(found: Found) -> tuple[bool, float, float]:
-    return found.worth
 
 
 def _read(path: Path) -> dict[str, Any] | None:

@@ -10,7 +10,9 @@ from ahoy_core.cost.choose import Alternative, alternatives, worth_telling
 from ahoy_core.cost.work import FRAMES, KNOBS, PIXELS, WORK
 from storage_schema.store import Manifest
 from tasks.cost.measured import MeasuredSet
-from tasks.cost.predict import LEAST_GAIN_DB, gains_of, ingested
+from tasks.cost.predict import LEAST_GAIN_DB, gains_of, ingested, work_knobs
+from tasks.presets import PRESETS
+from tasks.settings import Preset
 from tasks.stage import StageContext
 
 _TOLD = 5
@@ -61,7 +63,8 @@ def run_bill(ctx: StageContext, measured: MeasuredSet) -> RunBill:
         rows.append(BillRow(title, bill["wall_s"], bill["cpu_s"], bill["peak_rss_mb"], predicted.get(manifest.stage)))
     told = [row for row in rows if row.predicted_s]
     factor = sum(row.cpu_s for row in told) / max(sum(row.predicted_s or 0.0 for row in told), 1e-9) if told else 1.0
-    gains = gains_of(measured)
+    preset = nearest_round(measured, knobs)
+    gains = gains_of(measured, preset=preset)
     now = {knob: value for knob in gains.by_knob if (value := _value(ctx.manifests, knob)) is not None}
 
     def seconds(changes: Mapping[str, Any]) -> float:
@@ -70,8 +73,23 @@ def run_bill(ctx: StageContext, measured: MeasuredSet) -> RunBill:
     found = alternatives(gains, now, seconds)
     buys, saves = worth_telling(found, LEAST_GAIN_DB, _TOLD)
     captures = ", ".join(sorted({row.capture for row in measured.rows}))
-    where = f"captures {captures}, round preset {measured.preset}, on {measured.machine['cpu']}"
+    where = f"captures {captures}, round preset {preset}, on {measured.machine['cpu']}"
     return RunBill(tuple(rows), tuple(buys), tuple(saves), factor, where)
+
+
+def nearest_round(measured: MeasuredSet, knobs: Mapping[str, Any]) -> Preset:
+    """The preset with measured knobs that most of a run's knobs are those of: what a knob gains depends on the others.
+
+    Args:
+        measured: what is known of gain.
+        knobs: what decided the run's work, by name.
+    """
+
+    def alike(preset: Preset) -> int:
+        theirs = work_knobs(PRESETS[preset], {FRAMES: 0, PIXELS: 0})
+        return sum(knobs.get(name) == value for name, value in theirs.items())
+
+    return max((name for name in measured.rounds() if measured.gains(name)), key=alike, default=measured.preset)
 
 
 def known_knobs(ctx: StageContext) -> dict[str, Any]:

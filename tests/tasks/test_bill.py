@@ -79,6 +79,22 @@ def test_a_run_at_another_value_is_told_from_there_and_one_outside_is_not_told(
     assert not far.buys and not far.saves
 
 
+def test_a_run_is_told_what_knobs_gain_beside_the_preset_that_it_is_most_like(
+    measured: MeasuredSet, tmp_path: Path
+) -> None:
+    standard, steps = PRESETS["standard"], PRESETS["standard"].avatar.steps
+    more = (
+        replace(_row("preset", "standard", 21.0, steps), knobs=work_knobs(standard, {FRAMES: 4, PIXELS: 64})),
+        replace(_row("avatar.steps", 480, 25.0, 480), sweep="end-to-end.standard.avatar.steps",
+                setting={"preset": "standard", "avatar.steps": 480}),
+    )  # fmt: skip
+    both = replace(measured, rows=(*measured.rows, *more))
+    for settings, preset, values in ((standard, "standard", {480}), (DRAFT, "draft", {30, 240})):
+        bill = run_bill(_context(tmp_path, settings, 30.0), both)
+        assert f"round preset {preset}" in bill.measured_on
+        assert {one.value for one in (*bill.buys, *bill.saves)} == values
+
+
 def test_without_whole_runs_the_bill_is_there_and_names_no_knob(measured: MeasuredSet, tmp_path: Path) -> None:
     bill = run_bill(_context(tmp_path, DRAFT, 10.0), replace(measured, rows=()))
     assert len(bill.rows) == 5 and bill.factor == 1.0 and not (bill.buys or bill.saves)
