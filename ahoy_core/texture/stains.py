@@ -20,7 +20,7 @@ from ahoy_core.texture.texels import TexelMap
 
 EDGE_M = 0.04  # so far from unseen surface of the same part a stain may lie: some pixels of a whole person
 TURN_M = 0.04  # metres that a turn of the normal by a radian counts: an arm's unseen back is not near its front
-NEAR_M = 0.12  # further in than this nothing tells what the garment is like here
+NEAR_M = 0.12  # with no cloth further in so near, what is seen of the whole part tells: specks on an unseen leg
 CLOTH_M = 0.06  # the garment's colour is the median over so much cloth, from the nearest on
 VERTICES = 24  # ... and over no more vertices than these
 UNLIKE = 16.0  # CIE Lab, lightness counted less: folds and stripes are nearer to their garment than this
@@ -75,7 +75,7 @@ def _unlike(
     surface: Surface,
     texels: TexelMap,
 ) -> BoolArray:
-    """Which texels at the edge [E] are unlike what lies further in beside them; none where nothing does."""
+    """Which texels at the edge [E] are unlike what lies further in beside them, or else unlike the part as a whole."""
     within = np.zeros(len(place), dtype=bool)
     within[inner] = True
     (at, weight), (where, _) = (at_vertices(surface, texels, values, within) for values in (colours, place[:, :3]))
@@ -86,4 +86,5 @@ def _unlike(
     away, index = away.reshape(len(edge), count), index.reshape(len(edge), count)
     beside = away <= away[:, :1] + CLOTH_M
     garment = np.nanmedian(np.where(beside[:, :, None], at[there][index], np.nan), axis=1)
-    return np.asarray((np.linalg.norm(colours[edge] - garment, axis=1) > UNLIKE) & (away[:, 0] < NEAR_M))
+    garment[away[:, 0] > NEAR_M] = np.median(colours[inner], axis=0)
+    return np.asarray(np.linalg.norm(colours[edge] - garment, axis=1) > UNLIKE)

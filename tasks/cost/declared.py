@@ -122,7 +122,7 @@ END_TO_END_KNOBS: Mapping[Preset, Mapping[str, Sequence[Any]]] = {
         "perceive.passes": (2, 4),
         "coarse.map_size": (128, 256),
         "coarse.steps": (30, 60, 100),
-        "avatar.steps": (30, 60, 120, 240),
+        "avatar.steps": (30, 60, 120),
     },
 }
 """Swept one at a time over the whole run, from the video to the report, round these presets: what a knob gains beside

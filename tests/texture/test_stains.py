@@ -76,6 +76,17 @@ def test_a_clean_shirt_folds_and_a_colour_that_changes_slowly_lose_nothing(shirt
     assert not shirt.find(fading).any()
 
 
+def test_a_speck_far_from_all_cloth_is_a_stain_unless_it_is_like_the_garment(shirt: Shirt) -> None:
+    points = shirt.texels.points(shirt.rest, shirt.surface.faces)
+    speck = shirt.unseen & (points[:, 1] > 0.09) & (np.abs(points[:, 2] - 1.15) < 0.01)
+    for colour, dropped in ((WOOD, True), (SHIRT, False)):
+        colours, seen = shirt.colours.copy(), shirt.seen | speck
+        colours[speck] = colour
+        told = read_seen(observe(shirt.texels, colours, seen), shirt.surface, shirt.texels, shirt.rest, light=False)
+        found = find_stains(told, shirt.surface, shirt.texels)
+        assert speck.sum() > 3 and (found[speck] == dropped).all()
+
+
 def test_where_nothing_of_a_garment_lies_further_in_nothing_is_called_a_stain(shirt: Shirt) -> None:
     colours = shirt.colours.copy()
     colours[shirt.wood] = WOOD
