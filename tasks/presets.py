@@ -14,11 +14,10 @@ from collections.abc import Mapping
 
 from tasks.settings import Preset, Settings
 
-_BASE = Settings()
-STANDARD = _BASE.with_overrides(("perceive.iterations=30",))
+STANDARD = Settings()
 
 PRESETS: Mapping[Preset, Settings] = {
-    "draft": _BASE.with_overrides(
+    "draft": STANDARD.with_overrides(
         (
             "ingest.max_frames=48",
             "ingest.max_size=384",
