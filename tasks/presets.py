@@ -1,11 +1,12 @@
 """Three ways to spend time, picked from what was measured (docs/cost.md, end to end).
 
 What each costs and scores is its row `preset`, which `ahoy run` cites. `draft` is what knobs are changed around.
-`standard` takes what paid: maps of 256 (perceptual distance .166 for .179), 30 iterations of the fit and every frame in
-the texture (either gains on both captures), an atlas of 512; more steps than draft's bought nothing in either training.
-Four passes of the landmarks gain on both captures beside draft's knobs, but beside these the self-check of one then
-prefers the fill, and its pictures are .3 dB worse. `high` has sizes for larger pictures than the captures', where they
-gain nothing: on the one that it was run on .05 dB less than standard for 4.6 times the time, ST-LPIPS .152 for .153.
+`standard` takes what paid on both captures: maps of 256, an atlas of 512 and larger canonical views, every frame in the
+texture: ST-LPIPS .153 and .163 for draft's .163 and .179, at .02 and .26 dB less. More steps than draft's bought little
+in either training, and fewer in the avatar's cost little (its row `avatar.steps=30`). How often landmarks are read and
+how long the fit is iterated is draft's too: beyond that whole runs gained with one state of the code and lost with the
+next. `high` has sizes for larger pictures than the captures', where they gained nothing when they were last run: .05 dB
+less than standard on one of them for 4.6 times the time, ST-LPIPS .152 for .153.
 """
 
 from __future__ import annotations

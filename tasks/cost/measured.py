@@ -56,13 +56,19 @@ class MeasuredSet:
         return next((row for row in self.whole if dict(row.setting) == {knob: value}), None)
 
     def gains(self, preset: Preset | None = None) -> dict[str, dict[Any, float]]:
-        """Knob -> value -> dB over a preset on the capture where it gains least (`tasks.cost.summary.least_gains`).
+        """Knob -> value -> dB over a preset, each over the base on the capture where that is least.
+
+        So that a single change of any preset is worth what its row is worth (`tasks.cost.summary.least_gains`).
 
         Args:
             preset: of `rounds`; the base by default. Its own row was measured without overrides or not at all.
         """
-        known = least_gains(self.rows, self.preset, preset)
-        return {knob: values for knob, values in known.items() if knob != PRESET}
+        known, own = least_gains(self.rows, self.preset, preset), self.rounds().get(preset or self.preset, 0.0)
+        return {
+            knob: {value: gained - own for value, gained in values.items()}
+            for knob, values in known.items()
+            if knob != PRESET
+        }
 
     def rounds(self) -> dict[Preset, float]:
         """Presets that were run whole on all of the base's captures -> dB over it where they gain least."""

@@ -31,10 +31,10 @@ drawn over time, both logarithmic. What is swept, and against what, is declared 
 _FRONTS = {"PSNR": "rmse", "perceptual": "perceptual"}
 _WHOLE_WORDS = (
     "The columns of stages are their CPU seconds; SSIM and perceptual distance (less is better) are means of novel "
-    "views and novel poses. *Least gain* is what a budget counts: dB over the base (or the preset that is named) on "
-    f"the capture where that is least, a hundredth of perceptual distance taken as {SHARPNESS_DB / 100:.1f} dB; below "
-    "zero the row is worse on one at least, whatever the means say. The last column says in which figures no other row "
-    "is both cheaper and better."
+    "views and novel poses. *Least gain* is what a budget counts: dB over the base on the capture where that is least, "
+    f"a hundredth of perceptual distance taken as {SHARPNESS_DB / 100:.1f} dB; below zero the row is worse on one at "
+    "least, whatever the means say. A preset before a knob is the one that it was changed round. The last column says "
+    "in which figures no other row is both cheaper and better."
 )
 
 

@@ -65,20 +65,19 @@ def alike(rows: Sequence[Measurement]) -> list[Measurement]:
 
 
 def least_gains(rows: Sequence[Measurement], base: str, preset: str | None = None) -> dict[str, dict[Any, float]]:
-    """Knob of whole runs -> value -> dB over a preset (`tasks.cost.errors.gain`) on the capture where it gains least.
+    """Knob of whole runs -> value -> dB over the base (`tasks.cost.errors.gain`) on the capture where it gains least.
 
     Means would be chance: a third of the frames, or smaller ones, move single captures by .3 dB either way. Knobs that
-    were not run on all of the preset's captures are left out.
+    were not run on all of the base's captures are left out.
 
     Args:
         rows: of the set.
         base: preset that rows are round unless they name another.
-        preset: the one that is gained over; the base by default, which the other presets (knob `preset`) are compared
-            with too.
+        preset: that the knobs were changed round; the base by default, among whose knobs is `preset` too.
     """
     preset = preset or base
     whole = [(row, Change.of(row.setting, base)) for row in of_sweep(rows, END_TO_END) if not row.failed]
-    over = {row.capture: row for row, change in whole if change == Change(base, PRESET, preset)}
+    over = {row.capture: row for row, change in whole if change == Change(base, PRESET, base)}
     found: dict[str, dict[Any, dict[str, float]]] = {}
     for row, change in whole:
         if change.preset == preset and row.capture in over:

@@ -191,6 +191,19 @@ def test_a_gain_is_the_least_over_all_captures_of_the_base() -> None:
     assert replace(found, rows=(*rows, failed)).gains() == {}
 
 
+def test_a_single_change_of_another_preset_is_worth_what_its_own_row_is_over_the_base() -> None:
+    """On one capture the preset gains .1 and its change .4, on the other .5 and .2: minima must not be added up."""
+    rows = []
+    for capture, preset, changed in (("a", 0.1, 0.4), ("b", 0.5, 0.2)):
+        rows.append(_whole("preset", "draft", 20.0, 60, capture))
+        rows.append(_whole("preset", "standard", 20.0 + preset, 200, capture))
+        row = _whole("avatar.steps", 30, 20.0 + changed, 100, capture)
+        rows.append(replace(row, setting={"preset": "standard", "avatar.steps": 30}))
+    found = MeasuredSet(tuple(rows), 0.03, {"cpu": "x"}, "draft", ())
+    assert found.rounds() == {"draft": 0.0, "standard": pytest.approx(0.1)} and not found.gains()
+    assert found.rounds()["standard"] + found.gains("standard")["avatar.steps"][30] == pytest.approx(0.2)
+
+
 def test_a_prediction_knows_the_video_and_scales_with_the_machine(tmp_path: Path) -> None:
     rows = [
         Measurement("perceive.stride", {"stride": 1}, {"e": 1.0}, _once(n), _once(n), knobs=_knobs(clip__frames=n))
