@@ -72,9 +72,9 @@ class Steering:
         chosen = self._course.gains.by_knob
         values = {knob: self._changes.get(knob, self._course.gains.base[knob]) for knob in chosen}
         ref = call_directly(stage, settings.with_overrides(overrides_of(values)), inputs, run)
-        known = self._course.predictor.at(1.0).by_stage(self._changes).get(stage.name)
-        if stage.name in TRAININGS and ref.state != "cached" and known:
-            self._trained = ref.bill.wall_s / known
+        if stage.name in TRAININGS and ref.state != "cached":
+            known = self._course.predictor.at(1.0).by_stage(self._changes).get(stage.name)
+            self._trained = ref.bill.wall_s / known if known else None
         return ref
 
     def _choose(self, stage: str) -> None:

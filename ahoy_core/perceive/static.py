@@ -76,7 +76,7 @@ def scenery(usual: NDArray[np.float32], still: NDArray[np.bool_], outside: NDArr
         return np.zeros_like(still)
     patch = _patches(usual, still)
     size, away = (np.bincount(patch[part], minlength=int(patch.max()) + 1) for part in (still, still & outside))
-    return np.asarray(still & (away >= MOSTLY * np.maximum(size, 1))[patch])
+    return np.asarray(still & (away >= MOSTLY * size)[patch])
 
 
 def _patches(usual: NDArray[np.float32], still: NDArray[np.bool_]) -> NDArray[np.int32]:

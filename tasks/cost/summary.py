@@ -109,7 +109,7 @@ def omissions(rows: Sequence[Measurement], base: Preset) -> list[str]:
     ]
     there = {(row.sweep, shown(row.setting)) for row in rows}
     declared: dict[str, Mapping[str, Sequence[Any]]] = {name: one.knobs for name, one in STAGE_SWEEPS.items()}
-    declared[END_TO_END] = {PRESET: tuple(PRESETS), **END_TO_END_KNOBS[base]}
+    declared[END_TO_END] = {PRESET: tuple(PRESETS), **END_TO_END_KNOBS.get(base, {})}
     declared |= {f"{END_TO_END}.{name}": knobs for name, knobs in END_TO_END_KNOBS.items() if name != base}
     for stage, knobs in declared.items():
         for knob, values in knobs.items():

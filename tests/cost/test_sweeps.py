@@ -261,6 +261,7 @@ def test_captures_are_averaged_and_what_is_missing_is_an_omission() -> None:
     assert "end-to-end.preset = high, capture a: MemoryError: none" in said
     assert "end-to-end.preset = standard: not measured yet" in said and "texture.rule: not measured yet" in said
     assert "end-to-end.standard.avatar.steps: not measured yet" in said
+    assert "end-to-end.draft.avatar.steps: not measured yet" in omissions([], "high"), "a base without knobs of its own"
     assert any(line.startswith("hallucinate: no sweep of its own") for line in said)
 
 
