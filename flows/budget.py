@@ -104,16 +104,16 @@ def budgeted(
     bought = [_round(preset, request, fixed, measured, clip, factor, budget_s) for preset in measured.rounds()]
     best = max(bought, key=lambda one: one.worth)
 
-    def budget_of(changes: Mapping[str, Any]) -> Budget:
-        overrides = (*measured.overrides, *overrides_of(changes), *request.overrides)
-        return Budget(overrides, best.preset, best.choice.seconds, tuple(_said(best, measured, budget_s, factor)))
+    def overrides(changes: Mapping[str, Any]) -> tuple[str, ...]:
+        return (*measured.overrides, *overrides_of(changes), *request.overrides)
 
-    budget = budget_of(best.choice.changes)
+    said = tuple(_said(best, measured, budget_s, factor))
+    budget = Budget(overrides(best.choice.changes), best.preset, best.choice.seconds, said)
     _write(folder, asked, budget)
 
     def steered(changes: Mapping[str, Any], lines: Sequence[str]) -> None:
         told(lines[-1])
-        _write(folder, asked, replace(budget_of(changes), said=(*budget.said, *lines)))
+        _write(folder, asked, replace(budget, overrides=overrides(changes), said=(*said, *lines)))
 
     course = Course(gains_of(measured, fixed, best.preset), best.predictor, started, budget_s, measured.unit_cpu_s)
     return budget, Steering(course, best.choice.changes, steered)
