@@ -74,17 +74,9 @@ class _Mesh:
 
 def render(people: list[tuple[Person, list[FloatArray]]], boxes: list[Box], view: View, subject: int = 0) -> Picture:
     """Draw people (each with its posed parts) among boxes; masks are of one of them."""
-    parts = [
-        (p.faces, v, p.uvs, p.texture, p.tint, p.cut)
-        for who, posed in people
-        for p, v in zip(who.parts, posed, strict=True)
-    ]
-    owner = [number for number, (who, _) in enumerate(people) for _ in who.parts]
-    for item in boxes:
-        vertices, faces, uvs = mesh(item)
-        parts.append((faces, vertices, uvs, item.texture, np.ones((8, 3)), False))
-        owner.append(-1)
-    whole = _join(parts, view)
+    parts = [part for who, posed in people for part in _parts(who, posed)]
+    owner = [number for number, (who, _) in enumerate(people) for _ in who.parts] + [-1] * len(boxes)
+    whole = _join(parts + _furniture(boxes), view)
     mine = [i for i, number in enumerate(owner) if number == subject]
     alone = _join([parts[i] for i in mine], view)
     rays = _rays(view)
@@ -93,6 +85,35 @@ def render(people: list[tuple[Person, list[FloatArray]]], boxes: list[Box], view
     visible = (hit >= 0) & np.isin(whole.skin[np.maximum(hit, 0)], mine)
     amodal = _first_hits(alone, rays)[0] >= 0
     return Picture(*(_shrink(image, view) for image in (rgb, 255.0 * visible, 255.0 * amodal)))
+
+
+def render_alone(person: Person, posed: list[FloatArray], boxes: list[Box], view: View) -> NDArray[np.uint8]:
+    """The person without what stands before and behind, which still throws its shadows.
+
+    Returns:
+        [H,W,4] RGBA with straight alpha; black where alpha is 0.
+    """
+    mine = _parts(person, posed)
+    whole, rays = _join(mine + _furniture(boxes), view), _rays(view)
+    hit, bary, _ = _first_hits(_join(mine, view), rays)  # the person comes first: triangles keep their numbers
+    alpha = (hit >= 0).astype(np.float64)
+    rgb = np.clip(_shade(whole, view, hit, bary, rays), 0, 255) * alpha[:, None]
+    share = _reduce(alpha, view)
+    straight = _reduce(rgb, view) / np.maximum(share, 1e-6)[..., None]
+    rgba = np.concatenate([straight, 255 * share[..., None]], axis=2)
+    return np.where(rgba[..., 3:] >= 0.5, np.round(rgba), 0).astype(np.uint8)
+
+
+def _parts(who: Person, posed: list[FloatArray]) -> list[tuple]:  # type: ignore[type-arg]
+    return [(p.faces, v, p.uvs, p.texture, p.tint, p.cut) for p, v in zip(who.parts, posed, strict=True)]
+
+
+def _furniture(boxes: list[Box]) -> list[tuple]:  # type: ignore[type-arg]
+    parts = []
+    for item in boxes:
+        vertices, faces, uvs = mesh(item)
+        parts.append((faces, vertices, uvs, item.texture, np.ones((8, 3)), False))
+    return parts
 
 
 def _join(parts: list, view: View) -> _Mesh:  # type: ignore[type-arg]
@@ -208,7 +229,11 @@ def _normals(scene_mesh: _Mesh) -> FloatArray:
 
 
 def _shrink(values: FloatArray, view: View) -> NDArray[np.uint8]:
+    return np.round(_reduce(np.clip(values, 0, 255), view)).astype(np.uint8)
+
+
+def _reduce(values: FloatArray, view: View) -> FloatArray:
+    """Values [N,...] of rays to means [H,W,...] over pixels."""
     h, w = round(view.height * view.fine), round(view.width * view.fine)
-    image = np.clip(values.reshape(h, w, *values.shape[1:]), 0, 255).astype(np.float32)
-    small = cv2.resize(image, (view.width, view.height), interpolation=cv2.INTER_AREA)
-    return np.round(small).astype(np.uint8)
+    image = values.reshape(h, w, *values.shape[1:]).astype(np.float32)
+    return np.asarray(cv2.resize(image, (view.width, view.height), interpolation=cv2.INTER_AREA), np.float64)

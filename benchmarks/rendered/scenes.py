@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from ahoy_core.body.packaged import PackagedBody
 from benchmarks.rendered.motions import KINDS, carry, pose_from_dofs, sample_motion
@@ -68,6 +69,34 @@ def sample_scene(
         carried = _held(rng, body, person, pose, transl)
     room = sample_room(rng) + sample_occluders(rng, furniture)
     return Scene(person, pose, transl, room, carried, sample_view(rng, fine), {"motion": kind, "occluder": furniture})
+
+
+def sample_unseen(rng: np.random.Generator, scene: Scene, body: PackagedBody, frames: int) -> Scene:
+    """The same person in another kind of motion, without furniture, in the same light."""
+    kind = str(rng.choice([kind for kind in KINDS if kind not in (scene.facts["motion"], "stand")]))
+    with torch.no_grad():
+        rest = body(torch.zeros(1, body.n_joints, 3), scene.person.betas[None], torch.zeros(1, 3))
+    dofs = sample_motion(rng, kind, frames, FPS)
+    pose = torch.from_numpy(pose_from_dofs(body, rest.rest_joints[0].double().numpy(), dofs)).float()
+    return replace(
+        scene, pose=pose, transl=_on_the_floor(body, scene.person, pose, rng), room=[], carried=[],
+        facts={**scene.facts, "motion": kind},
+    )  # fmt: skip
+
+
+def views_around(view: View, rng: np.random.Generator) -> dict[str, View]:
+    """The input's camera and three more of its kind, from the left, the back and the right of who faces it."""
+    turns = {"front": 0.0} | {
+        name: at + rng.uniform(-8, 8) for name, at in (("left", 90), ("back", 180), ("right", -90))
+    }
+    return {name: _turned_view(view, degrees) for name, degrees in turns.items()}
+
+
+def _turned_view(view: View, degrees: float) -> View:
+    """A camera carried about the vertical line through the origin."""
+    carried = np.eye(4)
+    carried[:3, :3] = Rotation.from_euler("z", -degrees, degrees=True).as_matrix()
+    return replace(view, viewmat=view.viewmat @ carried)
 
 
 def sample_view(rng: np.random.Generator, fine: float) -> View:
