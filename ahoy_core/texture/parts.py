@@ -22,6 +22,8 @@ PART_NAMES = ("trunk", "legs", "head", "hands", "feet", "lower arms")
 # Waists lie within this share of the body's height of where the legs begin; trousers end this high above the sole.
 WAIST_BAND = 0.1
 HEM_BAND = 0.22
+# Seen heights that are further apart than this share of the body's height have something hidden between them.
+HIDDEN_GAP = 0.03
 # A cut has to leave this many seen vertices on either side.
 LEAST_SIDE = 12
 # Lightness counts this much beside hue and saturation (CIE Lab): folds and shadows change it, garments all three.
@@ -30,8 +32,6 @@ LIGHTNESS_WEIGHT = 0.3
 LEAST_CONTRAST = 8.0
 # ... and the cut explains at least this share of the colours' variance: prints and stripes do not.
 LEAST_EXPLAINED = 0.5
-# Cuts tried along a limb: one every centimetre or two.
-CUTS = 40
 
 
 @dataclass(frozen=True)
@@ -66,6 +66,9 @@ def find_parts(surface: Surface, vertices: FloatArray, colours: FloatArray, seen
         if waist is not None:
             part[body] = np.where(height[body] < waist, LEG_PART, TRUNK_PART)
             found.append("waist")
+        elif (below := _hidden_waist(height, colours, body & seen & (height < top + WAIST_BAND * tall), top)) is not None:
+            part[body] = np.where(height[body] < below, LEG_PART, TRUNK_PART)
+            found.append("waist")
         elif min((band & seen & legs).sum(), (band & seen & ~legs).sum()) >= LEAST_SIDE:
             part[body] = TRUNK_PART
     arms = dressed & (surface.limb == ARM)
@@ -83,6 +86,19 @@ def find_parts(surface: Surface, vertices: FloatArray, colours: FloatArray, seen
         found.append("hems")
     part[surface.head], part[surface.hands] = HEAD_PART, HAND_PART
     return Parts(part, tuple(found))
+
+
+def _hidden_waist(height: FloatArray, colours: FloatArray, seen: BoolArray, top: float) -> float | None:
+    """Where a garment begins of which only something far below was seen: behind a desk, the shirt's end too is hidden.
+
+    The colours tell between which two seen heights the border lies, not where; the height at which legs begin decides
+    as far as that goes.
+    """
+    cut = best_cut(height[seen], colours[seen])
+    if cut is None:
+        return None
+    low, high = height[seen & (height < cut)].max(), height[seen & (height >= cut)].min()
+    return float(np.clip(top, low, high)) if high - low > HIDDEN_GAP * height.max() else cut
 
 
 def _along_arms(vertices: FloatArray) -> FloatArray:
@@ -107,7 +123,7 @@ def best_cut(along: FloatArray, colours: FloatArray) -> float | None:
     if total <= 0:
         return None
     sums, count = np.cumsum(colours, axis=0), np.arange(1, len(along) + 1)
-    cuts = np.unique(np.linspace(LEAST_SIDE, len(along) - LEAST_SIDE, CUTS).round().astype(int))
+    cuts = np.arange(LEAST_SIDE, len(along) - LEAST_SIDE + 1)
     below, above = sums[cuts - 1] / count[cuts - 1, None], (sums[-1] - sums[cuts - 1]) / (len(along) - cuts)[:, None]
     between = cuts * (len(along) - cuts) / len(along) * np.square(below - above).sum(axis=1)
     best = int(between.argmax())

@@ -6,6 +6,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ahoy_core.texture.diffusion import Pull
+from ahoy_core.texture.parts import little_lightness
 from ahoy_core.texture.rays import BoolArray, FloatArray, IntArray
 from ahoy_core.texture.surface import Surface
 from ahoy_core.texture.texels import TexelMap
@@ -29,6 +30,8 @@ TOP_OF_HEAD = 0.75
 DEPTH_WEIGHT = 0.3
 # Vertices averaged into one guess: about 10 cm of cloth, so that no print is copied from front to back.
 FRONT_VERTICES = 24
+# Nearer than this to the skin's tone, in CIE Lab with lightness counted 0.3, what was seen of a garment's part is skin.
+SKIN_LIKE = 10.0
 # Further from anything seen (metres), the guess is dropped: a sock tells nothing about a shirt.
 FRONT_REACH = 0.15
 
@@ -101,7 +104,7 @@ def likely_colours(
     for number in np.unique(part[~surface.hands & ~surface.head]):
         own = (part == number) & ~surface.hands & ~surface.head
         if (known & own).any():
-            near, front = _front_for_back(vertices, colours, known & own, ~known & own)
+            near, front = _front_for_back(vertices, colours, _cloth(colours, known & own, skin), ~known & own)
             target[near], strength[near] = front, LIKELY_PULL
         else:
             strength[own] = LIKELY_PULL
@@ -114,6 +117,19 @@ def likely_colours(
     bare = surface.hands | face_points(vertices, normals, surface.head, vertices[surface.head][:, 2])
     target[bare], strength[bare] = skin, LIKELY_PULL
     return Pull(target, strength)
+
+
+def _cloth(colours: FloatArray, known: BoolArray, skin: FloatArray) -> BoolArray:
+    """Which known vertices of a part tell what its back looks like: not the skin in a collar, behind which is cloth.
+
+    Where at least half of a part looks like skin, it is bare, or cloth of that colour, and all of it counts.
+    """
+    lab = little_lightness(np.vstack([colours[known], skin]))
+    bare = np.linalg.norm(lab[:-1] - lab[-1], axis=1) < SKIN_LIKE
+    cloth = known.copy()
+    if bare.mean() < 0.5:
+        cloth[np.flatnonzero(known)[bare]] = False
+    return cloth
 
 
 def _front_for_back(
