@@ -90,4 +90,4 @@ def _roles(config: PerceiveConfig) -> Mapping[str, Role]:
     return {"body": packaged_body(), "pose": seen_by, "mask": seen_by, "head": ours("body's head region"), **learned}
 
 
-PERCEIVE = Stage("perceive", 7, PerceiveConfig, ("ingest",), run_perceive, _roles, fillable=FILLABLE)
+PERCEIVE = Stage("perceive", 8, PerceiveConfig, ("ingest",), run_perceive, _roles, fillable=FILLABLE)

@@ -110,4 +110,4 @@ def _roles(config: TextureConfig) -> Mapping[str, Role]:
     }
 
 
-TEXTURE = Stage("texture", 6, TextureConfig, ("ingest", "perceive"), run_texture, _roles, fillable=FILLABLE)
+TEXTURE = Stage("texture", 7, TextureConfig, ("ingest", "perceive"), run_texture, _roles, fillable=FILLABLE)

@@ -6,8 +6,6 @@ was seen from above leans by some degrees, feet on the floor and hips a hand's b
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -16,8 +14,10 @@ from torch import Tensor
 from ahoy_core.conventions import OBSERVED_VIEWMAT
 
 SOLES = (29, 30, 31, 32)  # heels and big toes
-CLEARANCE = (0.05, 0.05, 0.03, 0.03)  # metres of these landmarks above the floor, shoes' soles included
-SOFTNESS = 0.02  # metres above the lowest sole at which another one counts less
+CLEARANCE = (0.055, 0.055, 0.033, 0.033)  # metres of these landmarks above the floor, shoes' soles included
+SOFTNESS = 0.02  # metres above the lower of two at which the other one counts less
+# Where on the soles the trunk stands: a third of the way from heels to toes (4 cm behind the middle, over ten people).
+BEARING = (0.35, 0.35, 0.15, 0.15)
 TRUNK = (11, 12, 23, 24)  # shoulders and hips
 GROUND_SPREAD = 0.03  # metres
 GROUND_SCALE = 0.2  # metres: width of Geman-McClure; who jumps or sits is left alone
@@ -37,23 +37,34 @@ def ground_from_camera(viewmat: NDArray[np.floating]) -> Tensor:
     return torch.from_numpy(np.append(up @ OBSERVED_VIEWMAT[:3, :3].double().numpy(), height))
 
 
-def lowest_sole(landmarks: Tensor, ground: Tensor) -> tuple[Tensor, Tensor]:
-    """Height [N] in metres of the lowest sole above where it is when standing, from landmarks [N,33,3].
+def standing(landmarks: Tensor, ground: Tensor) -> tuple[Tensor, Tensor]:
+    """Heights [N,2] in metres of the lower heel and of the lower toes above where they are when standing.
 
-    A soft minimum: smooth where the weight goes from one foot to the other. Also its derivatives [N,4,3] by the soles.
+    Whoever stands or walks has both down, flat on one foot or, between two steps, a heel before and toes behind. One
+    of the four alone would not do: a body that is too small and too near gets there on the tip of a toe.
+
+    Args:
+        landmarks: [N,33,3] metres, world.
+        ground: [4], see `ground_from_camera`.
+
+    Returns:
+        Means that weigh the lower one, exact where both are down and where one is, and smooth between; and their
+        derivatives [N,2,4,3] by `SOLES`.
     """
     heights = landmarks[:, list(SOLES)] @ ground[:3] + ground[3]
-    heights = heights - heights.new_tensor(CLEARANCE)
-    # Mostly two soles, heel and toe, are down together: their soft minimum is their height.
-    lowest = SOFTNESS * (math.log(2) - torch.logsumexp(-heights / SOFTNESS, dim=1))
-    return lowest, torch.softmax(-heights / SOFTNESS, dim=1)[..., None] * ground[:3]
+    heights = (heights - heights.new_tensor(CLEARANCE)).unflatten(1, (2, 2))  # heels, toes; left, right
+    share = torch.softmax(-heights / SOFTNESS, dim=2)
+    lowest = (share * heights).sum(2)
+    slopes = share * (1 - (heights - lowest[..., None]) / SOFTNESS)
+    return lowest, (torch.eye(2).to(slopes)[..., None] * slopes[:, None]).flatten(2)[..., None] * ground[:3]
 
 
 def imbalance(landmarks: Tensor, ground: Tensor) -> Tensor:
-    """How far the trunk is from above the middle of the soles, along the floor: [N,3] metres.
+    """How far the trunk is from above the soles, along the floor: [N,3] metres.
 
     Linear in the landmarks [N,33,3]; derivatives of theirs, [N,33,3,P] moved to [N,P,33,3], give those of the result.
     """
-    apart = landmarks[..., list(TRUNK), :].mean(-2) - landmarks[..., list(SOLES), :].mean(-2)
+    feet = torch.einsum("...kc,k->...c", landmarks[..., list(SOLES), :], landmarks.new_tensor(BEARING))
+    apart = landmarks[..., list(TRUNK), :].mean(-2) - feet
     up = ground[:3]
     return apart - (apart @ up)[..., None] * up

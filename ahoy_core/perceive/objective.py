@@ -14,7 +14,7 @@ from ahoy_core.perceive.ground import (
     GROUND_SPREAD,
     SOLES,
     imbalance,
-    lowest_sole,
+    standing,
 )
 from ahoy_core.perceive.normal import Normal, add_rows, empty_normal
 from ahoy_core.perceive.outline import (
@@ -141,7 +141,7 @@ def _seen_terms(
         squared = image_offsets(landmarks, seen, person).square().sum(-1)
         terms["image"] = (seen.weights * geman_mcclure(squared, scale)).sum() / LANDMARK_SPREAD**2
     if seen.ground is not None:
-        height, _ = lowest_sole(landmarks, seen.ground)
+        height, _ = standing(landmarks, seen.ground)
         terms["ground"] = geman_mcclure(height.square(), GROUND_SCALE).sum() / GROUND_SPREAD**2
         leaning = imbalance(landmarks, seen.ground).square().sum(-1)
         terms["balance"] = geman_mcclure(leaning, BALANCE_SCALE).sum() / BALANCE_SPREAD**2
@@ -235,11 +235,11 @@ def _add_ground(normal: Normal, objective: Objective, linear: Linearised) -> Non
     ground = objective.seen.ground
     if ground is None:
         return
-    height, slopes = lowest_sole(linear.landmarks, ground)
-    rows = torch.einsum("nkip,nki->np", linear.d_landmarks[:, list(SOLES)], slopes)
+    height, slopes = standing(linear.landmarks, ground)
+    rows = torch.einsum("nkip,nrki->nrp", linear.d_landmarks[:, list(SOLES)], slopes)
     root = geman_mcclure_weight(height.square(), GROUND_SCALE).sqrt() / GROUND_SPREAD
     per_frame = normal.gradient.shape[1]
-    _add_rows(normal, (root * height)[:, None, None], (root[:, None] * rows)[:, None, None], per_frame)
+    _add_rows(normal, (root * height)[:, None], (root[..., None] * rows)[:, None], per_frame)
     leaning = imbalance(linear.landmarks, ground)
     rows = imbalance(linear.d_landmarks.permute(0, 3, 1, 2), ground).transpose(1, 2)
     root = geman_mcclure_weight(leaning.square().sum(-1), BALANCE_SCALE).sqrt()[:, None] / BALANCE_SPREAD

@@ -44,6 +44,8 @@ class ReducedBody:
         skin: [V,F] skinning weights, those of resting joints folded into the joint that carries them.
         stature: metres from the lowest to the highest point at `base_betas`.
         stature_slopes: [S].
+        size: which beta is mostly size, at the shape that the body was first reduced at. It stays that one: near some
+            shapes age is more like size than stature is, and a woman would become a child of her height.
         reach: [S] metres, root mean square over the surface, per unit of each beta; of the one that is mostly size,
             what it does besides making the whole body larger or smaller.
     """
@@ -61,6 +63,7 @@ class ReducedBody:
     stature: Tensor
     stature_slopes: Tensor
     reach: Tensor
+    size: int | None = None
 
     def __call__(self, rotations: Tensor, transl: Tensor, betas: Tensor) -> tuple[Tensor, Tensor]:
         """Pose the landmarks.
@@ -143,6 +146,8 @@ def reshape(reduced: ReducedBody, body: BodyModel, betas: Tensor) -> ReducedBody
             joints.append(out.rest_joints[0, list(reduced.free)].to(betas))
     m, j, surface = torch.stack(moments), torch.stack(joints), torch.stack(surfaces)
     slopes = (surface[1 : n + 1] - surface[n + 1 :]) / (2 * SHAPE_STEP)
+    whole, rest = _reaches(surface[0], slopes)
+    size = int((rest / whole.clamp_min(1e-9)).argmin()) if reduced.size is None else reduced.size
     height = surface[..., 2].amax(1) - surface[..., 2].amin(1)
     return replace(
         reduced,
@@ -155,20 +160,17 @@ def reshape(reduced: ReducedBody, body: BodyModel, betas: Tensor) -> ReducedBody
         surface_slopes=slopes,
         stature=height[0],
         stature_slopes=(height[1 : n + 1] - height[n + 1 :]) / (2 * SHAPE_STEP),
-        reach=_besides_size(surface[0], slopes),
+        reach=torch.where(torch.arange(n) == size, rest, whole),
+        size=size,
     )
 
 
-def _besides_size(surface: Tensor, slopes: Tensor) -> Tensor:
-    """Root mean square [S] of slopes [S,V,3]; uniform growth of the surface [V,3] is taken off the one that is most it.
-
-    Only that one: a parameter like age changes size too, but is not how adults differ in size.
-    """
+def _reaches(surface: Tensor, slopes: Tensor) -> tuple[Tensor, Tensor]:
+    """Root mean squares [S] of slopes [S,V,3], as they are and without the surface's [V,3] uniform growth."""
     centred, moved = surface - surface.mean(0), slopes - slopes.mean(1, keepdim=True)
     growth = (moved * centred).sum((1, 2)) / centred.square().sum()
     rest = (moved - growth[:, None, None] * centred).square().sum(-1).mean(-1).sqrt()
-    whole = slopes.square().sum(-1).mean(-1).sqrt()
-    return torch.where(torch.arange(len(slopes)) == (rest / whole.clamp_min(1e-9)).argmin(), rest, whole)
+    return slopes.square().sum(-1).mean(-1).sqrt(), rest
 
 
 def _carriers(parents: Sequence[int], row: dict[int, int]) -> list[int]:

@@ -3,8 +3,8 @@
 The networks' masks spill over furniture in front of a person, here in one frame, there in another, while those pixels
 never change. So wherever a pixel shows its usual colour, its mask is held at or below a low quantile of the values it
 got when it looked like that. Where the mask always spills over the same edge, the furniture itself tells: a patch that
-never changes, has no edge inside and lies mostly outside of all masks is no person anywhere. People's outlines move, so
-such a patch ends at them. With a moving camera few pixels keep a usual colour, and nothing happens.
+never changes, has no edge inside and lies mostly outside of all masks, or reaches well beyond them, is no person
+anywhere. People's outlines move, so such a patch ends at them. With a moving camera few pixels keep a usual colour, and nothing happens.
 """
 
 from __future__ import annotations
@@ -23,8 +23,9 @@ QUANTILE = 0.1
 STILL = 0.95  # share of the frames in which scenery looks as usual: people pass before it
 EDGE = 10.0  # of 255 between neighbouring pixels: a patch ends at a larger step of the usual picture
 OUTSIDE = 64  # of 255: masks held below it hold no person
-MOVED = 0.5  # largest share of the person that may look as usual all the time
+MOVED = 0.5  # largest share of the person, such patches apart, that may look as usual all the time
 MOSTLY = 0.5  # share of a patch that has to be outside
+SOME, BEYOND = 0.15, 6.0  # or so much of it, if it reaches so many pixels further than the masks: a screen before a belly
 RIM = 3  # pixels: as far out a patch may reach beyond where it was found
 ALIKE = 20.0  # of 255, between a patch and its rim
 
@@ -71,12 +72,14 @@ def scenery(usual: NDArray[np.float32], still: NDArray[np.bool_], outside: NDArr
     Returns:
         [H,W]; nothing where the person hardly moves, as their outline would not stop a patch.
     """
-    person = still[~outside]
-    if not len(person) or person.mean() > MOVED:
-        return np.zeros_like(still)
     patch = _patches(usual, still)
-    size, away = (np.bincount(patch[part], minlength=int(patch.max()) + 1) for part in (still, still & outside))
-    return np.asarray(still & (away >= MOSTLY * size)[patch])
+    count, away = int(patch.max()) + 1, still & outside
+    size, outer = (np.bincount(patch[part], minlength=count) for part in (still, away))
+    reach = np.zeros(count, np.float32)
+    np.maximum.at(reach, patch[away], cv2.distanceTransform(outside.astype(np.uint8), cv2.DIST_L2, 3)[away])
+    found = still & ((outer >= MOSTLY * size) | ((outer >= SOME * size) & (reach > BEYOND)))[patch]
+    person = still[~outside & ~found]
+    return found if len(person) and person.mean() <= MOVED else np.zeros_like(found)
 
 
 def _patches(usual: NDArray[np.float32], still: NDArray[np.bool_]) -> NDArray[np.int32]:
