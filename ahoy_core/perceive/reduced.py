@@ -21,11 +21,6 @@ SHAPE_STEP = (
     0.02  # of a finite difference in betas: large enough for float32, small enough for a shape space with bends
 )
 
-_SHAPED = (
-    "base_betas", "moments", "joints", "moment_slopes", "joint_slopes",
-    "surface", "surface_slopes", "stature", "stature_slopes", "reach",
-)  # fmt: skip
-
 
 @dataclass(frozen=True)
 class ReducedBody:
@@ -63,7 +58,7 @@ class ReducedBody:
     stature: Tensor
     stature_slopes: Tensor
     reach: Tensor
-    size: int | None = None
+    size: int
 
     def __call__(self, rotations: Tensor, transl: Tensor, betas: Tensor) -> tuple[Tensor, Tensor]:
         """Pose the landmarks.
@@ -125,7 +120,22 @@ def reduce_body(body: BodyModel, free: Sequence[int], betas: Tensor) -> ReducedB
     empty = betas.new_zeros(0)
     carriers = torch.tensor([carrier[joint] for joint in range(len(body.parents))])
     skin = betas.new_zeros(len(body.lbs_weights), len(chosen)).index_add_(1, carriers, body.lbs_weights.to(betas))
-    unshaped = ReducedBody(chosen, parents, skin=skin, **dict.fromkeys(_SHAPED, empty))
+    unshaped = ReducedBody(
+        free=chosen,
+        parents=parents,
+        base_betas=empty,
+        moments=empty,
+        joints=empty,
+        moment_slopes=empty,
+        joint_slopes=empty,
+        surface=empty,
+        surface_slopes=empty,
+        skin=skin,
+        stature=empty,
+        stature_slopes=empty,
+        reach=empty,
+        size=-1,
+    )
     return reshape(unshaped, body, betas)
 
 
@@ -147,7 +157,7 @@ def reshape(reduced: ReducedBody, body: BodyModel, betas: Tensor) -> ReducedBody
     m, j, surface = torch.stack(moments), torch.stack(joints), torch.stack(surfaces)
     slopes = (surface[1 : n + 1] - surface[n + 1 :]) / (2 * SHAPE_STEP)
     whole, rest = _reaches(surface[0], slopes)
-    size = int((rest / whole.clamp_min(1e-9)).argmin()) if reduced.size is None else reduced.size
+    size = reduced.size if reduced.size >= 0 else int((rest / whole.clamp_min(1e-9)).argmin())
     height = surface[..., 2].amax(1) - surface[..., 2].amin(1)
     return replace(
         reduced,

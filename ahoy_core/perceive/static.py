@@ -4,7 +4,8 @@ The networks' masks spill over furniture in front of a person, here in one frame
 never change. So wherever a pixel shows its usual colour, its mask is held at or below a low quantile of the values it
 got when it looked like that. Where the mask always spills over the same edge, the furniture itself tells: a patch that
 never changes, has no edge inside and lies mostly outside of all masks, or reaches well beyond them, is no person
-anywhere. People's outlines move, so such a patch ends at them. With a moving camera few pixels keep a usual colour, and nothing happens.
+anywhere. People's outlines move, so such a patch ends at them. With a moving camera few pixels keep a usual colour,
+and nothing happens.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ EDGE = 10.0  # of 255 between neighbouring pixels: a patch ends at a larger step
 OUTSIDE = 64  # of 255: masks held below it hold no person
 MOVED = 0.5  # largest share of the person, such patches apart, that may look as usual all the time
 MOSTLY = 0.5  # share of a patch that has to be outside
-SOME, BEYOND = 0.15, 6.0  # or so much of it, if it reaches so many pixels further than the masks: a screen before a belly
+SOME, BEYOND = 0.15, 6.0  # ... or so much of it, where it reaches so many pixels further: a screen before a belly
 RIM = 3  # pixels: as far out a patch may reach beyond where it was found
 ALIKE = 20.0  # of 255, between a patch and its rim
 

@@ -63,11 +63,10 @@ def find_parts(surface: Surface, vertices: FloatArray, colours: FloatArray, seen
         top = float(np.quantile(height[legs & dressed], 0.95)) if (legs & dressed).any() else 0.0
         band = body & (np.abs(height - top) < WAIST_BAND * tall)
         waist = best_cut(height[band & seen], colours[band & seen])
+        if waist is None:
+            waist = _hidden_waist(height, colours, body & seen & (height < top + WAIST_BAND * tall), top)
         if waist is not None:
             part[body] = np.where(height[body] < waist, LEG_PART, TRUNK_PART)
-            found.append("waist")
-        elif (below := _hidden_waist(height, colours, body & seen & (height < top + WAIST_BAND * tall), top)) is not None:
-            part[body] = np.where(height[body] < below, LEG_PART, TRUNK_PART)
             found.append("waist")
         elif min((band & seen & legs).sum(), (band & seen & ~legs).sum()) >= LEAST_SIDE:
             part[body] = TRUNK_PART

@@ -32,6 +32,8 @@ DEPTH_WEIGHT = 0.3
 FRONT_VERTICES = 24
 # Nearer than this to the skin's tone, in CIE Lab with lightness counted 0.3, what was seen of a garment's part is skin.
 SKIN_LIKE = 10.0
+# ... that far from the head (metres) at most: an open collar.
+COLLAR_REACH = 0.15
 # Further from anything seen (metres), the guess is dropped: a sock tells nothing about a shirt.
 FRONT_REACH = 0.15
 
@@ -104,7 +106,9 @@ def likely_colours(
     for number in np.unique(part[~surface.hands & ~surface.head]):
         own = (part == number) & ~surface.hands & ~surface.head
         if (known & own).any():
-            near, front = _front_for_back(vertices, colours, _cloth(colours, known & own, skin), ~known & own)
+            near, front = _front_for_back(
+                vertices, colours, _cloth(surface, vertices, colours, known & own, skin), ~known & own
+            )
             target[near], strength[near] = front, LIKELY_PULL
         else:
             strength[own] = LIKELY_PULL
@@ -119,16 +123,21 @@ def likely_colours(
     return Pull(target, strength)
 
 
-def _cloth(colours: FloatArray, known: BoolArray, skin: FloatArray) -> BoolArray:
+def _cloth(
+    surface: Surface, vertices: FloatArray, colours: FloatArray, known: BoolArray, skin: FloatArray
+) -> BoolArray:
     """Which known vertices of a part tell what its back looks like: not the skin in a collar, behind which is cloth.
 
     Where at least half of a part looks like skin, it is bare, or cloth of that colour, and all of it counts.
     """
+    numbers = np.flatnonzero(known)
     lab = little_lightness(np.vstack([colours[known], skin]))
     bare = np.linalg.norm(lab[:-1] - lab[-1], axis=1) < SKIN_LIKE
+    if not surface.head.any() or bare.mean() >= 0.5:
+        return known
+    near = cKDTree(vertices[surface.head]).query(vertices[known])[0] < COLLAR_REACH
     cloth = known.copy()
-    if bare.mean() < 0.5:
-        cloth[np.flatnonzero(known)[bare]] = False
+    cloth[numbers[bare & near]] = False
     return cloth
 
 

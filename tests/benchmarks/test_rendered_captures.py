@@ -1,4 +1,4 @@
-"""Captures of our own making: pictures, cameras and bodies of one capture agree, and the evaluation's reader takes it."""
+"""Captures of our own making: pictures, cameras and bodies agree, and the evaluation's reader takes them."""
 
 from __future__ import annotations
 

@@ -72,6 +72,18 @@ def test_the_reduced_body_has_the_landmarks_of_the_whole_body(body: PackagedBody
     torch.testing.assert_close(joints.float(), whole.joints[:, list(reduced.free)], atol=2e-5, rtol=0)
 
 
+def test_stature_stays_what_people_differ_by_where_age_would_do(body: PackagedBody) -> None:
+    """A little below adult age, age makes a body larger more evenly than stature does: a child would be as likely."""
+    _, reduced, _ = setting(body)
+    height, age = (body.beta_names.index(name) for name in ("height", "age"))
+    young = reduced.base_betas.clone()
+    young[age] -= 0.07
+    moved = reshape(reduced, body, young)
+    assert reduced.size == moved.size == height
+    assert reduce_body(body, reduced.free, young).size == age, "this shape does not try what the test is for"
+    assert float(moved.reach[age]) > 5 * float(moved.reach[height])
+
+
 def test_derivatives_by_hand_equal_automatic_ones(body: PackagedBody) -> None:
     _, reduced, state = setting(body)
     linear = linearise(reduced, state)

@@ -138,6 +138,20 @@ def test_the_back_of_the_clothes_changes_colour_where_the_front_does(
     assert error.mean() < 20
 
 
+def test_behind_an_open_collar_there_is_cloth(
+    body: CapsuleBody, surface: Surface, texels: TexelMap, rest: np.ndarray
+) -> None:
+    points = texels.points(rest, surface.faces)
+    part = part_of(body, surface, texels)
+    skin, shirt = np.array([80.0, 50, 40]), np.array([200.0, 205, 210])
+    top = float(points[part == "torso"][:, 2].max())
+    open_at = (part == "torso") & (points[:, 2] > top - 0.12) & (np.abs(points[:, 0]) < 0.08)
+    colours = np.where((open_at | (part == "head"))[:, None], skin, shirt)
+    filled = fill_atlas(observe(texels, colours, points[:, 1] < 0), surface, texels, rest, "harmonic", light=False)
+    nape = (part == "torso") & (points[:, 2] > top - 0.12) & (points[:, 1] > 0.06)
+    assert filled.rgb.reshape(-1, 3)[texels.flat][nape].mean(0)[0] > 150
+
+
 def test_the_back_of_the_head_takes_the_colour_of_its_top_not_of_the_face(
     body: CapsuleBody, surface: Surface, texels: TexelMap, rest: np.ndarray
 ) -> None:

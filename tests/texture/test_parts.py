@@ -59,6 +59,17 @@ def test_a_dress_is_one_part_and_an_unseen_lower_half_is_not(surface: Surface, r
     assert (find_parts(surface, rest, colours, ~legs).of_vertex[legs] == LEG_PART).all()
 
 
+def test_trousers_that_show_at_one_ankle_begin_where_the_shirt_may_end(surface: Surface, rest: np.ndarray) -> None:
+    """Behind a desk: the shirt reaches a little down the legs, its end and the knees are hidden."""
+    height = rest[:, 2]
+    seen = (height > 0.76) | ((height < 0.3) & (rest[:, 0] < 0))
+    parts = find_parts(surface, rest, np.where((height > 0.5)[:, None], SHIRT, TROUSERS), seen)
+    assert "waist" in parts.found
+    legs = (surface.limb == 2) & ~surface.feet
+    assert (parts.of_vertex[legs & (height < 0.75)] == LEG_PART).all()
+    assert (parts.of_vertex[legs & seen & (height > 0.76)] == TRUNK_PART).all()
+
+
 def test_short_sleeves_end_where_the_skin_begins(surface: Surface, rest: np.ndarray, body: CapsuleBody) -> None:
     arm = np.char.startswith(body.parts, "arm")
     bare = arm & (rest[:, 2] < 1.1)
