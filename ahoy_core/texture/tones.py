@@ -6,13 +6,15 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ahoy_core.texture.diffusion import Pull
-from ahoy_core.texture.parts import little_lightness
+from ahoy_core.texture.parts import LEG_PART, little_lightness
 from ahoy_core.texture.rays import BoolArray, FloatArray, IntArray
 from ahoy_core.texture.surface import Surface
 from ahoy_core.texture.texels import TexelMap
 
 NEUTRAL_SKIN = (198.0, 160.0, 138.0)
 NEUTRAL_CLOTH = (128.0, 128.0, 128.0)
+# Trousers are darker than the middle grey: about the median of those that nine rendered people wear, jeans among them.
+NEUTRAL_TROUSERS = (70.0, 70.0, 72.0)
 NEUTRAL_SHOE = (66.0, 62.0, 60.0)
 # Strength of a guess against a link between neighbours: it takes over about 1 / sqrt(pull) vertices, some 4 cm, from
 # the last colour that was seen. Weaker, and skin washes out over the shoulders and jeans over the shirt's back.
@@ -102,6 +104,7 @@ def likely_colours(
     """
     target = np.tile(np.array(NEUTRAL_CLOTH), (len(vertices), 1))
     strength = np.zeros(len(vertices))
+    target[part == LEG_PART] = NEUTRAL_TROUSERS
     target[surface.feet] = NEUTRAL_SHOE
     for number in np.unique(part[~surface.hands & ~surface.head]):
         own = (part == number) & ~surface.hands & ~surface.head

@@ -11,7 +11,7 @@ from ahoy_core.texture.fill import fill_atlas
 from ahoy_core.texture.links import mirror_texels, texel_links
 from ahoy_core.texture.surface import Surface
 from ahoy_core.texture.texels import TexelMap, texel_normals
-from ahoy_core.texture.tones import NEUTRAL_CLOTH, NEUTRAL_SKIN
+from ahoy_core.texture.tones import NEUTRAL_SKIN, NEUTRAL_TROUSERS
 
 from .synthetic import CapsuleBody, smooth_paint
 
@@ -56,7 +56,7 @@ def test_nothing_seen_gives_neutral_cloth_and_skin(
     colours = filled.rgb.reshape(-1, 3)[texels.flat].astype(float)
     part = part_of(body, surface, texels)
     np.testing.assert_allclose(colours[part == "hand.L"].mean(axis=0), NEUTRAL_SKIN, atol=8)
-    np.testing.assert_allclose(colours[part == "leg.R"].mean(axis=0), NEUTRAL_CLOTH, atol=8)
+    np.testing.assert_allclose(colours[part == "leg.R"].mean(axis=0), NEUTRAL_TROUSERS, atol=8)
 
 
 def test_only_skin_seen_does_not_spread_skin_over_the_clothes(
@@ -66,7 +66,7 @@ def test_only_skin_seen_does_not_spread_skin_over_the_clothes(
     colours = np.tile([200.0, 20, 60], (len(part), 1))
     filled = fill_atlas(observe(texels, colours, part == "head"), surface, texels, rest)
     legs = filled.rgb.reshape(-1, 3)[texels.flat][part == "leg.L"].astype(float)
-    np.testing.assert_allclose(legs.mean(axis=0), NEUTRAL_CLOTH, atol=8)
+    np.testing.assert_allclose(legs.mean(axis=0), NEUTRAL_TROUSERS, atol=8)
 
 
 def test_one_seen_texel_colours_its_own_part_and_no_other(
@@ -79,7 +79,7 @@ def test_one_seen_texel_colours_its_own_part_and_no_other(
     filled = fill_atlas(observe(texels, colours, seen), surface, texels, rest).rgb.reshape(-1, 3)[texels.flat]
     torso, legs = filled[part == "torso"].astype(float), filled[part == "leg.L"].astype(float)
     np.testing.assert_allclose(torso, np.tile([200.0, 20, 60], (len(torso), 1)), atol=15)
-    np.testing.assert_allclose(legs, np.tile(NEUTRAL_CLOTH, (len(legs), 1)), atol=1)
+    np.testing.assert_allclose(legs, np.tile(NEUTRAL_TROUSERS, (len(legs), 1)), atol=1)
 
 
 def test_an_unseen_right_hand_takes_the_colours_of_the_left(
