@@ -9,7 +9,7 @@ approximation, for a body with plain LBS.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -39,10 +39,10 @@ class ReducedBody:
         skin: [V,F] skinning weights, those of resting joints folded into the joint that carries them.
         stature: metres from the lowest to the highest point at `base_betas`.
         stature_slopes: [S].
-        size: which beta is mostly size, at the shape that the body was first reduced at. It stays that one: near some
-            shapes age is more like size than stature is, and a woman would become a child of her height.
         reach: [S] metres, root mean square over the surface, per unit of each beta; of the one that is mostly size,
             what it does besides making the whole body larger or smaller.
+        size: which beta is mostly size, at the shape that the body was first reduced at. It stays that one: near some
+            shapes age is more like size than stature is, and a woman would become a child of her height.
     """
 
     free: tuple[int, ...]
@@ -117,30 +117,20 @@ def reduce_body(body: BodyModel, free: Sequence[int], betas: Tensor) -> ReducedB
     row = {joint: i for i, joint in enumerate(chosen)}
     carrier = _carriers(body.parents, row)
     parents = tuple(-1 if j == 0 else carrier[body.parents[j]] for j in chosen)
-    empty = betas.new_zeros(0)
     carriers = torch.tensor([carrier[joint] for joint in range(len(body.parents))])
     skin = betas.new_zeros(len(body.lbs_weights), len(chosen)).index_add_(1, carriers, body.lbs_weights.to(betas))
-    unshaped = ReducedBody(
-        free=chosen,
-        parents=parents,
-        base_betas=empty,
-        moments=empty,
-        joints=empty,
-        moment_slopes=empty,
-        joint_slopes=empty,
-        surface=empty,
-        surface_slopes=empty,
-        skin=skin,
-        stature=empty,
-        stature_slopes=empty,
-        reach=empty,
-        size=-1,
-    )
-    return reshape(unshaped, body, betas)
+    return _shaped(chosen, parents, skin, body, betas, None)
 
 
 def reshape(reduced: ReducedBody, body: BodyModel, betas: Tensor) -> ReducedBody:
     """Rebuild the linear shape model round other betas [S]."""
+    return _shaped(reduced.free, reduced.parents, reduced.skin, body, betas, reduced.size)
+
+
+def _shaped(
+    free: tuple[int, ...], parents: tuple[int, ...], skin: Tensor, body: BodyModel, betas: Tensor, size: int | None
+) -> ReducedBody:
+    """The linear shape model round betas [S]; without `size` that is chosen here."""
     n = len(betas)
     step = SHAPE_STEP * torch.eye(n).to(betas)
     steps = torch.cat([torch.zeros_like(betas)[None], step, -step])
@@ -151,16 +141,17 @@ def reshape(reduced: ReducedBody, body: BodyModel, betas: Tensor) -> ReducedBody
     with torch.no_grad():
         for shape in (betas + steps).to(like):
             out = body(like.new_zeros(1, body.n_joints, 3), shape[None], like.new_zeros(1, 3))
-            moments.append(_moments(weights, reduced.skin[support], out.rest_vertices[0, support].to(betas)))
+            moments.append(_moments(weights, skin[support], out.rest_vertices[0, support].to(betas)))
             surfaces.append(out.rest_vertices[0].to(betas))
-            joints.append(out.rest_joints[0, list(reduced.free)].to(betas))
+            joints.append(out.rest_joints[0, list(free)].to(betas))
     m, j, surface = torch.stack(moments), torch.stack(joints), torch.stack(surfaces)
     slopes = (surface[1 : n + 1] - surface[n + 1 :]) / (2 * SHAPE_STEP)
     whole, rest = _reaches(surface[0], slopes)
-    size = reduced.size if reduced.size >= 0 else int((rest / whole.clamp_min(1e-9)).argmin())
+    size = int((rest / whole.clamp_min(1e-9)).argmin()) if size is None else size
     height = surface[..., 2].amax(1) - surface[..., 2].amin(1)
-    return replace(
-        reduced,
+    return ReducedBody(
+        free=free,
+        parents=parents,
         base_betas=betas.detach().clone(),
         moments=m[0],
         joints=j[0],
@@ -168,6 +159,7 @@ def reshape(reduced: ReducedBody, body: BodyModel, betas: Tensor) -> ReducedBody
         joint_slopes=(j[1 : n + 1] - j[n + 1 :]) / (2 * SHAPE_STEP),
         surface=surface[0],
         surface_slopes=slopes,
+        skin=skin,
         stature=height[0],
         stature_slopes=(height[1 : n + 1] - height[n + 1 :]) / (2 * SHAPE_STEP),
         reach=torch.where(torch.arange(n) == size, rest, whole),

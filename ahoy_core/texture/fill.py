@@ -23,12 +23,11 @@ import numpy as np
 from ahoy_core.texture.atlas import ObservedAtlas
 from ahoy_core.texture.diffusion import Pull, solve_links, vertex_links
 from ahoy_core.texture.links import mirror_texels, texel_links
-from ahoy_core.texture.parts import LEG_PART
 from ahoy_core.texture.rays import BoolArray, FloatArray, IntArray
 from ahoy_core.texture.seen import at_vertices, nearest_vertex, read_seen
 from ahoy_core.texture.surface import Surface
 from ahoy_core.texture.texels import TexelMap, pad_charts
-from ahoy_core.texture.tones import NEUTRAL_CLOTH, NEUTRAL_TROUSERS, likely_colours, skin_tone
+from ahoy_core.texture.tones import likely_colours, neutral_cloth, skin_tone
 
 FillKind = Literal["both", "harmonic", "symmetric"]
 
@@ -87,9 +86,8 @@ def fill_atlas(
     skin, skin_from = skin_tone(surface, texels, vertices, normals, colours, seen)
     if fill == "symmetric":
         for number in np.unique(part):
-            own = part == number
-            neutral = NEUTRAL_TROUSERS if number == LEG_PART else NEUTRAL_CLOTH
-            guess[own & ~known] = np.median(guess[own & known], axis=0) if (own & known).any() else neutral
+            there, missing = ((part == number) & some for some in (known, ~known))
+            guess[missing] = np.median(guess[there], axis=0) if there.any() else neutral_cloth(part[missing])
         completed = guess
     else:
         value, weight = at_vertices(surface, texels, guess, known)

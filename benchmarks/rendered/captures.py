@@ -8,7 +8,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from ahoy_core.body.convert import to_local_ref
 from ahoy_core.body.packaged import PackagedBody
@@ -55,8 +54,8 @@ def write_capture(folder: Path, seed: int, wardrobe: Wardrobe, frames: int) -> N
     unseen = sample_unseen(apart, scene, body, UNSEEN_FRAMES)
     shown = np.linspace(0, UNSEEN_FRAMES - 1, UNSEEN_SHOWN).round().astype(int).tolist()
     views = views_around(scene.view, apart)
-    _write_true_pictures(folder / "gt", scene, body, views, list(range(0, frames, TRUTH_EVERY)), keep_numbers=True)
-    _write_true_pictures(folder / "novel", unseen, body, views, shown, keep_numbers=False)
+    _write_true_pictures(folder / "gt", scene, body, views, {t: t for t in range(0, frames, TRUTH_EVERY)})
+    _write_true_pictures(folder / "novel", unseen, body, views, dict(enumerate(shown)))
     _write_cameras(folder / "cameras.json", views)
     _write_motion(folder / "motion.npz", scene, body, list(range(frames)))
     _write_motion(folder / "novel_motion.npz", unseen, body, shown)
@@ -66,13 +65,13 @@ def write_capture(folder: Path, seed: int, wardrobe: Wardrobe, frames: int) -> N
 
 
 def _write_true_pictures(
-    folder: Path, scene: Scene, body: PackagedBody, views: dict[str, View], frames: list[int], *, keep_numbers: bool
+    folder: Path, scene: Scene, body: PackagedBody, views: dict[str, View], frames: dict[int, int]
 ) -> None:
-    for place, frame in enumerate(frames):
+    """Pictures of all cameras; `frames`: number in the file's name -> frame of the scene."""
+    for number, frame in frames.items():
         posed = scene.person.posed(body, scene.pose[frame], scene.transl[frame])
         for name, view in views.items():
-            rgba: NDArray[np.uint8] = render_alone(scene.person, posed, scene.boxes(frame), view)
-            number = frame if keep_numbers else place
+            rgba = render_alone(scene.person, posed, scene.boxes(frame), view)
             cv2.imwrite(str(folder / f"{name}_{number:03d}.png"), rgba[..., [2, 1, 0, 3]])
 
 

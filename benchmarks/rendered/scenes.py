@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ahoy_core.body.packaged import PackagedBody
-from benchmarks.rendered.motions import KINDS, carry, pose_from_dofs, sample_motion
+from benchmarks.rendered.motions import KINDS, Dofs, carry, pose_from_dofs, sample_motion
 from benchmarks.rendered.people import Person, Wardrobe
 from benchmarks.rendered.render import View
 from benchmarks.rendered.rooms import Box, carried_box, sample_occluders, sample_room
@@ -60,9 +60,7 @@ def sample_scene(
     holds = kind in ("stand", "step", "turn") and rng.random() < 0.3
     if holds:
         carry(dofs, rng)
-    with torch.no_grad():
-        rest = body(torch.zeros(1, body.n_joints, 3), person.betas[None], torch.zeros(1, 3))
-    pose = torch.from_numpy(pose_from_dofs(body, rest.rest_joints[0].double().numpy(), dofs)).float()[:frames]
+    pose = _poses(body, person, dofs)[:frames]
     transl = _on_the_floor(body, person, pose, rng)
     carried: list[Box] = []
     if holds:
@@ -74,10 +72,7 @@ def sample_scene(
 def sample_unseen(rng: np.random.Generator, scene: Scene, body: PackagedBody, frames: int) -> Scene:
     """The same person in another kind of motion, without furniture, in the same light."""
     kind = str(rng.choice([kind for kind in KINDS if kind not in (scene.facts["motion"], "stand")]))
-    with torch.no_grad():
-        rest = body(torch.zeros(1, body.n_joints, 3), scene.person.betas[None], torch.zeros(1, 3))
-    dofs = sample_motion(rng, kind, frames, FPS)
-    pose = torch.from_numpy(pose_from_dofs(body, rest.rest_joints[0].double().numpy(), dofs)).float()
+    pose = _poses(body, scene.person, sample_motion(rng, kind, frames, FPS))
     return replace(
         scene, pose=pose, transl=_on_the_floor(body, scene.person, pose, rng), room=[], carried=[],
         facts={**scene.facts, "motion": kind},
@@ -115,6 +110,13 @@ def sample_view(rng: np.random.Generator, fine: float) -> View:
     K = np.array([[focal, 0, SIZE / 2], [0, focal, SIZE / 2], [0, 0, 1]])
     light = np.array([rng.normal(0, 0.6), -rng.uniform(0.2, 1), rng.uniform(0.6, 1.5)])
     return View(viewmat, K, SIZE, SIZE, fine, light / np.linalg.norm(light), rng.uniform(0.45, 0.75))
+
+
+def _poses(body: PackagedBody, person: Person, dofs: Dofs) -> torch.Tensor:
+    """Poses [T,J,3] of a motion on somebody's own bones."""
+    with torch.no_grad():
+        rest = body(torch.zeros(1, body.n_joints, 3), person.betas[None], torch.zeros(1, 3))
+    return torch.from_numpy(pose_from_dofs(body, rest.rest_joints[0].double().numpy(), dofs)).float()
 
 
 def _on_the_floor(body: PackagedBody, person: Person, pose: torch.Tensor, rng: np.random.Generator) -> torch.Tensor:
