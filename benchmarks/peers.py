@@ -13,7 +13,7 @@ import sys
 import tempfile
 import types
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -32,10 +32,11 @@ class PeerUnavailableError(RuntimeError):
 
 @dataclass(frozen=True)
 class Peer:
-    """A name, and how to prepare a scene."""
+    """A name, how to prepare a scene, and whether it runs on a GPU, where only the wall clock tells its time."""
 
     name: str
     prepare: Callable[[Scene], Run]
+    gpu: bool = False
 
 
 def leaves(scene: Scene) -> list[Tensor]:
@@ -63,6 +64,22 @@ def ours(scene: Scene) -> Run:
 
 def _values(scene: Scene) -> tuple[Tensor, ...]:
     return scene.means, scene.quats, scene.scales, scene.opacities, scene.colors, scene.viewmats
+
+
+def gsplat_cuda(scene: Scene) -> Run:
+    """The same call on a GPU, which is gsplat's kernels; each run waits until the GPU is done."""
+    if not torch.cuda.is_available():
+        raise PeerUnavailableError("no NVIDIA GPU here")
+    if importlib.util.find_spec("gsplat") is None:
+        raise PeerUnavailableError("gsplat is not installed: pip install -c constraints.txt '.[cuda]'")
+    tensors = {name: value.cuda() for name, value in vars(scene).items() if isinstance(value, Tensor)}
+    render = ours(replace(scene, **tensors))
+
+    def run(backward: bool) -> None:
+        render(backward)
+        torch.cuda.synchronize()
+
+    return run
 
 
 def yardstick(scene: Scene) -> Run:
@@ -224,4 +241,9 @@ def _indices_in_range(
     return torch.from_numpy(gaussians), torch.from_numpy(pixels), torch.zeros(len(pixels), dtype=torch.int64)
 
 
-PEERS = (Peer("ahoy", ours), Peer("C++ AVX2 yardstick", yardstick), Peer("gsplat torch reference", gsplat_torch))
+PEERS = (
+    Peer("ahoy", ours),
+    Peer("C++ AVX2 yardstick", yardstick),
+    Peer("gsplat torch reference", gsplat_torch),
+    Peer("gsplat on a GPU", gsplat_cuda, gpu=True),
+)

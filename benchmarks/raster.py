@@ -102,6 +102,7 @@ def _peer_row(spec: SceneSpec, peer: Peer, backward: bool, times: dict[str, list
         "kind": "speed",
         "scene": spec.name,
         "peer": peer.name,
+        "gpu": peer.gpu,
         "pass": "forward+backward" if backward else "forward",
         "cpu_ms": asdict(Spread.of([cpu * 1e3 for cpu in mine])),
         "wall_ms": asdict(Spread.of([wall * 1e3 for wall, _ in times[peer.name]])),
@@ -191,11 +192,12 @@ def tables(rows: list[Row]) -> str:
     ]
     speed = {(r["scene"], r["peer"], r["pass"]): r for r in rows if r["kind"] == "speed"}
     for (scene, peer, name), row in speed.items():
-        if name == "forward+backward":
+        if name == "forward+backward" and not row["gpu"]:
             ahead, cpu, ratio = speed[scene, peer, "forward"]["cpu_ms"]["median"], row["cpu_ms"], row["cpu_over_ahoy"]
             span = f"{cpu['low']:.1f}-{cpu['high']:.1f}"
             lines.append(f"| {scene} | {peer} | {ahead:.1f} | {cpu['median']:.1f} | {span} | {ratio['median']:.2f} |")
     lines += [f"| {r['scene']} | {r['peer']} | left out: {r['why']} | | | |" for r in rows if r["kind"] == "omission"]
+    lines += ["", *_gpu_table(speed)]
     lines += ["", "| scene | pairs blended a pixel | floor, CPU ms | share of the floor reached |", "|---|---|---|---|"]
     for row in (r for r in rows if r["kind"] == "floor"):
         mine = speed[row["scene"], "ahoy", "forward+backward"]["cpu_ms"]["median"]
@@ -218,6 +220,20 @@ def tables(rows: list[Row]) -> str:
             f"| {row['sweep']} | {value} | {image:.1e} | {gradient:.1e} | {row['cpu_s']['median'] * 1e3:.2f} |"
         )
     return "\n".join(lines)
+
+
+def _gpu_table(speed: dict[tuple[str, str, str], Row]) -> list[str]:
+    """On a GPU the wall clock counts: it and ours on all of the machine's cores, a scene and pass a line."""
+    lines = [
+        "| scene | pass | on the GPU, wall ms | range | ahoy on the CPU, wall ms | ahoy / GPU |",
+        "|---|---|---|---|---|---|",
+    ]
+    for (scene, _, name), row in speed.items():
+        if row["gpu"]:
+            there, here = row["wall_ms"], speed[scene, PEERS[0].name, name]["wall_ms"]["median"]
+            span, ratio = f"{there['low']:.2f}-{there['high']:.2f}", here / there["median"]
+            lines.append(f"| {scene} | {name} | {there['median']:.2f} | {span} | {here:.1f} | {ratio:.1f} |")
+    return lines
 
 
 if __name__ == "__main__":

@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
+import numpy as np
+import torch
 from torch import Tensor
 
 from ahoy_core.splat.constants import ALPHA_CUTOFF, TRANSMITTANCE_STOP
+
+IN_META = ("radii", "means2d", "depths", "conics", "opacities", "tiles_per_gauss")
+"""What gsplat's meta holds a row of for each Gaussian, [C,N,...]."""
 
 
 def rasterize_cuda(
     tensors: dict[str, Tensor | None], options: dict[str, Any], alpha_cutoff: float, transmittance_stop: float
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """Hand a validated call to `gsplat.rasterization`.
+    """Hand a validated call to `gsplat.rasterization`, kept from what its kernels take amiss.
+
+    They keep depths *at* the planes, spread the NaN of one row over the image, and divide by the number of Gaussians.
 
     Raises:
         ImportError: If gsplat is not installed.
@@ -35,6 +43,59 @@ def rasterize_cuda(
             raise NotImplementedError(
                 f"{name}: expected float32 on a GPU, got {tensor.dtype}; convert it with .float()"
             )
-    colors, alphas, meta = gsplat.rasterization(**tensors, **options, packed=False)
+    options = options | {
+        "near_plane": _next_float32(options["near_plane"], math.inf),
+        "far_plane": _next_float32(options["far_plane"], -math.inf),
+    }
+    trailing = {"means": 1, "quats": 1, "scales": 1, "covars": 2, "opacities": 0}
+    trailing["colors"] = 1 if options["sh_degree"] is None else 2
+    means = tensors["means"]
+    assert means is not None
+    if not len(means):
+        tensors = _with_a_row(tensors, trailing)
+    finite = _finite_rows(tensors, trailing)
+    colors, alphas, meta = gsplat.rasterization(**_mended(tensors, finite, trailing), **options, packed=False)
+    if not len(means):
+        meta |= {name: meta[name][:, :0] for name in IN_META}
     meta["n_isects"] = int(meta["flatten_ids"].numel())
+    meta["n_invalid"] = len(means) - int(finite.sum())
     return colors, alphas, meta
+
+
+def _next_float32(value: float, towards: float) -> float:
+    """The float32 beside it (Python's floats are rounded on their way into the kernels)."""
+    return float(np.nextafter(np.float32(value), np.float32(towards)))
+
+
+def _with_a_row(tensors: dict[str, Tensor | None], trailing: dict[str, int]) -> dict[str, Tensor | None]:
+    """No Gaussian at all as one that is broken, so that it is not drawn; what depends on the inputs still does."""
+    padded = dict(tensors)
+    for name, axes in trailing.items():
+        tensor = tensors[name]
+        if tensor is not None:
+            padded[name] = torch.nn.functional.pad(tensor, (0, 0) * axes + (0, 1), value=math.nan)
+    return padded
+
+
+def _finite_rows(tensors: dict[str, Tensor | None], trailing: dict[str, int]) -> Tensor:
+    """Gaussians without a NaN or an infinity in any of these, bool [N]; `trailing` counts the axes behind N."""
+    whole = []
+    for name, axes in trailing.items():
+        tensor = tensors[name]
+        if tensor is not None:
+            rows = torch.isfinite(tensor)
+            rows = rows.flatten(tensor.ndim - axes).all(-1) if axes else rows
+            whole.append(rows.flatten(0, -2).all(0) if rows.ndim > 1 else rows)  # colours may have cameras in front
+    return torch.stack(whole).all(0)
+
+
+def _mended(tensors: dict[str, Tensor | None], finite: Tensor, trailing: dict[str, int]) -> dict[str, Tensor | None]:
+    """Broken rows made invisible, and zero quaternions the identity; neither gets a gradient."""
+    mended = dict(tensors)
+    for name, axes in trailing.items():
+        tensor = tensors[name]
+        if tensor is not None:
+            kept = finite if name != "quats" else finite & (tensor != 0).any(-1)
+            neutral = {"quats": torch.eye(4)[0], "covars": torch.eye(3)}.get(name, torch.zeros(()))
+            mended[name] = torch.where(kept.reshape(-1, *(1,) * axes), tensor, neutral.to(tensor))
+    return mended

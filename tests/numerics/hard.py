@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from tests.splat.scenes import Scene, convert, random_scene
+
+Render = Callable[..., Any]
+"""`rasterization`, on the CPU or there and back over a GPU."""
 
 
 def with_rows(scene: Scene, rows: slice | list[int], **values: Any) -> Scene:

@@ -9,16 +9,16 @@ import torch
 from ahoy_core.splat import rasterization
 from ahoy_core.splat._binning import to_offsets
 from ahoy_core.splat._plan import Tiling, intersection_bytes
-from tests.numerics.hard import frontal_scene
+from tests.numerics.hard import Render, frontal_scene
 from tests.splat.scenes import Scene, assert_matches_oracle, calm_scene, random_scene, run, select
 
 
 @pytest.mark.parametrize(
     "options", [{}, {"sh_degree": 2}, {"covars": True}, {"count": 2}, {"render_mode": "RGB+ED"}], ids=str
 )
-def test_empty_input_is_background_with_gradients_of_the_right_shape(options: dict) -> None:
+def test_empty_input_is_background_with_gradients_of_the_right_shape(render: Render, options: dict) -> None:
     scene = select(random_scene(0, **options), torch.arange(0))
-    rendered = run(rasterization, scene)
+    rendered = run(render, scene)
     expected = scene["backgrounds"][:, None, None].expand(-1, 33, 40, -1)
     assert torch.equal(rendered.colors[..., :3], expected)
     assert not rendered.alphas.any()
@@ -27,10 +27,10 @@ def test_empty_input_is_background_with_gradients_of_the_right_shape(options: di
         assert torch.isfinite(grad).all(), name
 
 
-def test_nothing_in_view_is_background_with_zero_gradients() -> None:
+def test_nothing_in_view_is_background_with_zero_gradients(render: Render) -> None:
     scene = random_scene(0, n=20)
     scene["means"] = scene["means"] + 1e4
-    rendered = run(rasterization, scene)
+    rendered = run(render, scene)
     assert torch.equal(rendered.colors, scene["backgrounds"][:, None, None].expand_as(rendered.colors))
     assert not any(
         rendered.grads[name].any() for name in ("means", "quats", "scales", "opacities", "colors", "viewmats")
@@ -38,8 +38,8 @@ def test_nothing_in_view_is_background_with_zero_gradients() -> None:
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 40), (40, 1), (16, 16), (17, 15), (31, 33), (7, 50)], ids=str)
-def test_any_image_size_matches_the_oracle(size: tuple[int, int]) -> None:
-    assert_matches_oracle(rasterization, calm_scene(1, n=40, width=size[0], height=size[1]))
+def test_any_image_size_matches_the_oracle(render: Render, size: tuple[int, int]) -> None:
+    assert_matches_oracle(render, calm_scene(1, n=40, width=size[0], height=size[1]))
 
 
 @pytest.mark.parametrize("size", [(33, 40), (64, 64), (5, 3)], ids=str)
@@ -55,13 +55,13 @@ def test_tiles_of_8_16_and_32_give_the_same_bits(size: tuple[int, int]) -> None:
             )
 
 
-def test_thousands_of_screen_filling_gaussians_match_the_oracle() -> None:
+def test_thousands_of_screen_filling_gaussians_match_the_oracle(render: Render) -> None:
     scene = frontal_scene(3000, width=40, height=33)
     generator = torch.Generator().manual_seed(0)
     scene["scales"] = 5 + torch.rand(3000, 3, generator=generator)
     scene["means"][:, 2] = 3 + torch.randperm(3000, generator=generator) / 3000
     scene["opacities"] = 0.006 + 0.001 * torch.rand(3000, generator=generator)
-    assert_matches_oracle(rasterization, scene)
+    assert_matches_oracle(render, scene)
 
 
 def screen_filling(n: int, width: int, height: int) -> Scene:

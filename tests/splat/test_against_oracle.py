@@ -54,6 +54,10 @@ MODES: dict[str, dict[str, Any]] = {
 
 @pytest.mark.parametrize("mode", MODES)
 def test_image_and_every_gradient_match_the_oracle(backend: str, mode: str) -> None:
+    if backend == "cuda" and mode == "other thresholds":
+        with pytest.raises(NotImplementedError, match=r"alpha_cutoff: expected 0\.0039.* on a GPU, got 0\.001"):
+            rasterization(**convert(random_scene(1, **MODES[mode]), device=backend))
+        return
     assert_matches_oracle(rasterization, calm_scene(1, **MODES[mode]), device=backend)
 
 
