@@ -1,12 +1,13 @@
 """Three ways to spend time, picked from what was measured (docs/cost.md, end to end).
 
 What each costs and scores is its row `preset`, which `ahoy run` cites. `draft` is what knobs are changed around.
-`standard` takes what paid on both captures: maps of 256, an atlas of 512 and larger canonical views, every frame in the
-texture: ST-LPIPS .153 and .163 for draft's .163 and .179, at .02 and .26 dB less. More steps than draft's bought little
-in either training, and fewer in the avatar's cost little (its row `avatar.steps=30`). How often landmarks are read and
-how long the fit is iterated is draft's too: beyond that whole runs gained with one state of the code and lost with the
-next. `high` has sizes for larger pictures than the captures', where they gained nothing when they were last run: .05 dB
-less than standard on one of them for 4.6 times the time, ST-LPIPS .152 for .153.
+`standard` takes maps of 256, an atlas of 512, larger canonical views and every frame in the texture: a mean ST-LPIPS of
+.191 for draft's .203 over four captures, at .14 dB less. More steps than draft's bought nothing in either training, and
+fewer in the avatar's cost little (its row `avatar.steps=30`). How often landmarks are read and how long the fit is
+iterated is draft's too: what whole runs gained by more of it changed its sign with the state of the code (four passes
+gain .11 to .24 dB on each of the four captures, and lose .06 over eight others). `high` has sizes for
+larger pictures than the captures', where they gained nothing when they were last run, with the fits before: .05 dB less
+than standard on one of them for 4.6 times the time.
 """
 
 from __future__ import annotations

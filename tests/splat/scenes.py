@@ -21,7 +21,7 @@ IMAGE_ATOL = 1e-5
 """Largest error of a pixel, relative to max(1, value), on scenes where no threshold flips."""
 GRAD_RTOL = 1e-4
 """Largest relative L2 error of a gradient on such scenes."""
-GPU_SLACK = 3.0
+GPU_SLACK = 10.0
 """On a GPU gradients may be this much further off: gsplat sums them in float32, in no fixed order, with fast maths."""
 FLIP_MARGIN = 3e-5
 """Decisions nearer to their threshold than this may fall differently in float32 (a few ulp of a dozen operations)."""
