@@ -1,7 +1,7 @@
 """Speed, memory and accuracy-against-time of the CPU rasterizer, beside its peers.
 
-    python -m benchmarks.raster --json raster.jsonl            # everything; some minutes
-    python -m benchmarks.raster --quick                        # the smallest scene only
+    OMP_WAIT_POLICY=passive python -m benchmarks.raster --json raster.jsonl   # everything; some minutes
+    OMP_WAIT_POLICY=passive python -m benchmarks.raster --quick               # the smallest scene only
 
 Writes JSON lines (one measurement a line, the machine in the first) and prints the tables of docs/rasterizer.md.
 """
@@ -124,7 +124,8 @@ def scaling_rows() -> list[Row]:
     large = [replace(base, name=f"50k@{size}", size=size) for size in (128, 256, 512, 1024)]
     rows = [_scaling_row("gaussians", spec, torch.get_num_threads()) for spec in many]
     rows += [_scaling_row("resolution", spec, torch.get_num_threads()) for spec in large]
-    return rows + [_scaling_row("threads", base, threads) for threads in range(1, (os.cpu_count() or 1) + 1)]
+    doubled = [2**k for k in range((os.cpu_count() or 1).bit_length())]
+    return rows + [_scaling_row("threads", spec, threads) for spec in SCENES for threads in doubled]
 
 
 def _scaling_row(axis: str, spec: SceneSpec, threads: int) -> Row:
@@ -197,7 +198,8 @@ def tables(rows: list[Row]) -> str:
             span = f"{cpu['low']:.1f}-{cpu['high']:.1f}"
             lines.append(f"| {scene} | {peer} | {ahead:.1f} | {cpu['median']:.1f} | {span} | {ratio['median']:.2f} |")
     lines += [f"| {r['scene']} | {r['peer']} | left out: {r['why']} | | | |" for r in rows if r["kind"] == "omission"]
-    lines += ["", *_gpu_table(speed)]
+    if any(row["gpu"] for row in speed.values()):
+        lines += ["", *_gpu_table(speed)]
     lines += ["", "| scene | pairs blended a pixel | floor, CPU ms | share of the floor reached |", "|---|---|---|---|"]
     for row in (r for r in rows if r["kind"] == "floor"):
         mine = speed[row["scene"], "ahoy", "forward+backward"]["cpu_ms"]["median"]

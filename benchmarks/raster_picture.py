@@ -26,7 +26,9 @@ def main() -> None:
     rows = [json.loads(line) for line in Path(sys.argv[1]).read_text().splitlines()]
     figure, (scene, bars, precision) = pyplot.subplots(1, 3, figsize=(14, 4.4), dpi=100)
     _draw_scene(scene)
-    _draw_bars(bars, [row for row in rows if row["kind"] == "speed" and row["pass"] == "forward+backward"])
+    _draw_bars(
+        bars, [row for row in rows if row["kind"] == "speed" and row["pass"] == "forward+backward" and not row["gpu"]]
+    )
     _draw_precision(precision, [row for row in rows if row["kind"] == "accuracy" and not row["failed"]])
     figure.tight_layout()
     figure.savefig(sys.argv[2])

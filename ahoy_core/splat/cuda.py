@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from ahoy_core.splat.constants import ALPHA_CUTOFF, TRANSMITTANCE_STOP
 
@@ -39,7 +40,7 @@ def rasterize_cuda(
         if value != built_in:
             raise NotImplementedError(f"{name}: expected {built_in} on a GPU, got {value}: gsplat's is built in")
     for name, tensor in tensors.items():
-        if tensor is not None and str(tensor.dtype) != "torch.float32":
+        if tensor is not None and tensor.dtype != torch.float32:
             raise NotImplementedError(
                 f"{name}: expected float32 on a GPU, got {tensor.dtype}; convert it with .float()"
             )
@@ -47,18 +48,22 @@ def rasterize_cuda(
         "near_plane": _next_float32(options["near_plane"], math.inf),
         "far_plane": _next_float32(options["far_plane"], -math.inf),
     }
-    trailing = {"means": 1, "quats": 1, "scales": 1, "covars": 2, "opacities": 0}
-    trailing["colors"] = 1 if options["sh_degree"] is None else 2
-    means = tensors["means"]
-    assert means is not None
-    if not len(means):
-        tensors = _with_a_row(tensors, trailing)
-    finite = _finite_rows(tensors, trailing)
-    colors, alphas, meta = gsplat.rasterization(**_mended(tensors, finite, trailing), **options, packed=False)
-    if not len(means):
+    axes = {"means": 1, "quats": 1, "scales": 1, "covars": 2, "opacities": 0}
+    axes["colors"] = 1 if options["sh_degree"] is None else 2
+    gaussians = {name: tensor for name, tensor in tensors.items() if name in axes and tensor is not None}
+    count = len(gaussians["means"])
+    if not count:
+        # One that is broken instead, so that it is not drawn; what depends on the inputs still does.
+        gaussians = {
+            name: pad(value, (0, 0) * axes[name] + (0, 1), value=math.nan) for name, value in gaussians.items()
+        }
+    finite = _finite_rows(gaussians, axes)
+    n_invalid = count - int(finite.sum())
+    mended = tensors | _mended(gaussians, axes, finite)
+    colors, alphas, meta = gsplat.rasterization(**mended, **options, packed=False)
+    if not count:
         meta |= {name: meta[name][:, :0] for name in IN_META}
-    meta["n_isects"] = int(meta["flatten_ids"].numel())
-    meta["n_invalid"] = len(means) - int(finite.sum())
+    meta |= {"n_isects": int(meta["flatten_ids"].numel()), "n_invalid": n_invalid}
     return colors, alphas, meta
 
 
@@ -67,35 +72,24 @@ def _next_float32(value: float, towards: float) -> float:
     return float(np.nextafter(np.float32(value), np.float32(towards)))
 
 
-def _with_a_row(tensors: dict[str, Tensor | None], trailing: dict[str, int]) -> dict[str, Tensor | None]:
-    """No Gaussian at all as one that is broken, so that it is not drawn; what depends on the inputs still does."""
-    padded = dict(tensors)
-    for name, axes in trailing.items():
-        tensor = tensors[name]
-        if tensor is not None:
-            padded[name] = torch.nn.functional.pad(tensor, (0, 0) * axes + (0, 1), value=math.nan)
-    return padded
-
-
-def _finite_rows(tensors: dict[str, Tensor | None], trailing: dict[str, int]) -> Tensor:
-    """Gaussians without a NaN or an infinity in any of these, bool [N]; `trailing` counts the axes behind N."""
+def _finite_rows(gaussians: dict[str, Tensor], axes: dict[str, int]) -> Tensor:
+    """Gaussians without a NaN or an infinity in any of these, bool [N]; `axes` counts those behind N."""
     whole = []
-    for name, axes in trailing.items():
-        tensor = tensors[name]
-        if tensor is not None:
-            rows = torch.isfinite(tensor)
-            rows = rows.flatten(tensor.ndim - axes).all(-1) if axes else rows
-            whole.append(rows.flatten(0, -2).all(0) if rows.ndim > 1 else rows)  # colours may have cameras in front
+    for name, tensor in gaussians.items():
+        rows = torch.isfinite(tensor)
+        rows = rows.flatten(tensor.ndim - axes[name]).all(-1) if axes[name] else rows
+        whole.append(rows.flatten(0, -2).all(0) if rows.ndim > 1 else rows)  # colours may have cameras in front
     return torch.stack(whole).all(0)
 
 
-def _mended(tensors: dict[str, Tensor | None], finite: Tensor, trailing: dict[str, int]) -> dict[str, Tensor | None]:
+def _mended(gaussians: dict[str, Tensor], axes: dict[str, int], finite: Tensor) -> dict[str, Tensor]:
     """Broken rows made invisible, and zero quaternions the identity; neither gets a gradient."""
-    mended = dict(tensors)
-    for name, axes in trailing.items():
-        tensor = tensors[name]
-        if tensor is not None:
-            kept = finite if name != "quats" else finite & (tensor != 0).any(-1)
-            neutral = {"quats": torch.eye(4)[0], "covars": torch.eye(3)}.get(name, torch.zeros(()))
-            mended[name] = torch.where(kept.reshape(-1, *(1,) * axes), tensor, neutral.to(tensor))
+    mended = {}
+    for name, tensor in gaussians.items():
+        kept, neutral = finite, tensor.new_zeros(())
+        if name == "quats":
+            kept, neutral = finite & (tensor != 0).any(-1), torch.eye(4, device=tensor.device)[0]
+        elif name == "covars":
+            neutral = torch.eye(3, device=tensor.device)
+        mended[name] = torch.where(kept.reshape(-1, *(1,) * axes[name]), tensor, neutral)
     return mended
