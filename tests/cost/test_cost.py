@@ -52,6 +52,7 @@ def test_a_meter_tells_waiting_from_working() -> None:
 
 PASSING_ALLOCATION = """
 import time
+import numpy as np
 from ahoy_core.cost import Meter
 with Meter() as before:
     pass
