@@ -12,7 +12,7 @@ demo: models  ## the main job on the bundled clip; prints where the avatar, the 
 	OMP_WAIT_POLICY=passive $(BIN)/ahoy run ahoy_core/assets/demo.mp4 --out out/demo
 
 test: models lint  ## style, types, layers, then the whole suite, one process more than cores: some tests mostly wait
-	OMP_NUM_THREADS=1 OMP_WAIT_POLICY=passive $(BIN)/pytest --dist loadfile --durations 25 \
+	OMP_NUM_THREADS=1 OMP_WAIT_POLICY=passive $(BIN)/pytest --dist loadfile --no-loadscope-reorder --durations 25 \
 		--numprocesses $$($(BIN)/python -c 'import os; print((os.cpu_count() or 1) + 1)')
 
 lint: $(INSTALLED)

@@ -29,8 +29,9 @@ Kept = list[tuple[Mapping[str, Any], list[str]]]
 
 
 def _gains() -> Gains:
-    """Steps that always pay, so that what is left of a budget can be used."""
-    steps = {"avatar.steps": {15: -1.0, 120: 0.0, 960: 1.0}, "coarse.steps": {15: -0.1, 60: 0.0, 240: 0.1}}
+    """Steps that always pay, so that what is left of a budget can be used; doubled like those that are measured."""
+    avatar = {15 * 2**k: (k - 3) / 3 for k in range(7)}
+    steps = {"avatar.steps": avatar, "coarse.steps": {15: -0.1, 60: 0.0, 240: 0.1}}
     stride = {"texture.frame_stride": {2: 0.0, 1: 0.5}}
     return Gains({**steps, **stride}, {"avatar.steps": 120, "coarse.steps": 60, "texture.frame_stride": 2})
 
