@@ -11,11 +11,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
-from scipy.signal import fftconvolve
 
 FloatArray = NDArray[np.floating]
 IntArray = NDArray[np.integer]
@@ -207,7 +207,7 @@ class Packer:
         stamp = np.zeros((height, width), dtype=np.float32)
         stamp[rows, cols] = 1
         for side, taken in enumerate(self.taken):
-            overlap = fftconvolve(taken.astype(np.float32), stamp[::-1, ::-1], mode="valid")
+            overlap = cv2.matchTemplate(taken.astype(np.float32), stamp, cv2.TM_CCORR)
             spots = np.argwhere(overlap < 0.5)
             if len(spots):
                 return side, int(spots[0][0]), int(spots[0][1])

@@ -182,8 +182,13 @@ def _missed(surface: Surface, charts: list[Chart]) -> Chart:
     points = surface.at(faces, bary)
     far = np.flatnonzero(_distances(charts, points) > _FAR * REACH)
     keep = np.ones(len(far), dtype=bool)
-    for first, second in sorted(cKDTree(points[far]).query_pairs(_FAR * REACH)) if len(far) else ():
-        keep[second] &= not keep[first]
+    if len(far):
+        first, second = cKDTree(points[far]).query_pairs(_FAR * REACH, output_type="ndarray").T  # first < second
+        second = second[np.argsort(first, kind="stable")]
+        ends = np.searchsorted(np.sort(first), np.arange(len(far) + 1))
+        for point in range(len(far)):  # in order: whoever is still kept sends away those near it
+            if keep[point]:
+                keep[second[ends[point] : ends[point + 1]]] = False
     return scattered(surface, faces[far[keep]], bary[far[keep]])
 
 

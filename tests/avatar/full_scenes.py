@@ -102,6 +102,7 @@ def faces(count: int = 2) -> FaceViews:
     )
 
 
+@cache
 def full_inputs(with_faces: bool = True) -> FullInputs:
     """Observed frames, two sequences and face views of one person; the template knows only grey."""
     observed = coarse_inputs()
