@@ -11,8 +11,11 @@ QUIET_PIP := --disable-pip-version-check --quiet
 demo: models  ## the main job on the bundled clip; prints where the avatar, the video and the report are
 	OMP_WAIT_POLICY=passive $(BIN)/ahoy run ahoy_core/assets/demo.mp4 --out out/demo
 
-test: models lint  ## style, types, layers, then the whole suite, one process more than cores: some tests mostly wait
-	OMP_NUM_THREADS=1 OMP_WAIT_POLICY=passive $(BIN)/pytest --dist loadfile --no-loadscope-reorder --durations 25 \
+# One process more than cores, since some tests mostly wait. Where bytecode is switched off, it is switched on: hundreds of
+# processes start, and each would compile our modules anew.
+test: models lint  ## style, types, layers, then the whole suite
+	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 OMP_WAIT_POLICY=passive \
+		$(BIN)/pytest --dist loadfile --no-loadscope-reorder --durations 25 \
 		--numprocesses $$($(BIN)/python -c 'import os; print((os.cpu_count() or 1) + 1)')
 
 lint: $(INSTALLED)
