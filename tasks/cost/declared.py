@@ -105,7 +105,7 @@ STAGE_SWEEPS: Mapping[str, StageSweep] = {
 
 END_TO_END_KNOBS: Mapping[Preset, Mapping[str, Sequence[Any]]] = {
     "draft": {
-        "ingest.max_size": (192, 256),
+        "ingest.max_size": (192, 384),
         "ingest.max_frames": (16, 48),
         "perceive.passes": (1, 2, 4),
         "perceive.iterations": (3, 10, 30),
