@@ -31,7 +31,7 @@ def _rows(run: SmallRun, table: str) -> list[dict]:
 
 def test_the_paths_of_avatar_video_and_report_are_printed_and_are_there(small_run: SmallRun) -> None:
     for name in ("avatar.ply", "avatar.safetensors", "turntable.mp4", "motion.mp4", "report.html"):
-        assert re.search(rf"{re.escape(name)}\s+\S", small_run.result.output), small_run.result.output
+        assert re.search(rf"{re.escape(name)}\s+\S", small_run.output), small_run.output
         assert (small_run.folder / name).stat().st_size > 0
 
 
