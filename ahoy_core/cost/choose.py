@@ -89,7 +89,7 @@ class Choice:
 
 
 def choose(gains: Gains, seconds: Seconds, budget_s: float, steps: Sequence[str] = ()) -> Choice:
-    """Try every combination of the measured values and take the most accurate that fits; of equal ones the cheapest.
+    """Try every combination of worthwhile values and take the most accurate that fits; of equal ones the cheapest.
 
     Args:
         gains: of the knobs that may be changed.
@@ -102,9 +102,9 @@ def choose(gains: Gains, seconds: Seconds, budget_s: float, steps: Sequence[str]
     """
     if not budget_s > 0:
         raise ValueError(f"expected a budget above 0 s, got {budget_s}")
-    options = {knob: gains.values(knob, BETWEEN if knob in steps else 0) for knob in gains.by_knob}
+    options = {knob: _worthwhile(gains, knob, seconds, BETWEEN if knob in steps else 0) for knob in gains.by_knob}
     if math.prod(map(len, options.values())) > MOST_COMBINATIONS:
-        options = {knob: gains.values(knob, 0) for knob in gains.by_knob}
+        options = {knob: _worthwhile(gains, knob, seconds, 0) for knob in gains.by_knob}
     best: tuple[float, float, dict[str, Any]] | None = None
     cheapest: tuple[float, float, dict[str, Any]] | None = None
     for values in product(*options.values()):
@@ -121,6 +121,21 @@ def choose(gains: Gains, seconds: Seconds, budget_s: float, steps: Sequence[str]
     now = {**gains.base, **changed}
     beyond = [one for one in alternatives(gains, now, seconds) if one.gain > 0]
     return Choice(changed, gain, took, fits, tuple(sorted(beyond, key=_price)))
+
+
+def _worthwhile(gains: Gains, knob: str, seconds: Seconds, between: int) -> list[Any]:
+    """Values of a knob than which no other is both as accurate and as cheap, and the base's.
+
+    Which of two values is the cheaper one does not depend on the other knobs: each of them makes a run longer or
+    shorter throughout.
+    """
+    priced = [(seconds({knob: v}), -(gains.at(knob, v) or 0.0), v) for v in gains.values(knob, between)]
+    kept, least = [], math.inf
+    for _, loss, value in sorted(priced, key=lambda one: one[:2]):
+        if loss < least or value == gains.base[knob]:
+            kept.append(value)
+        least = min(least, loss)
+    return kept
 
 
 def alternatives(gains: Gains, now: Mapping[str, Any], seconds: Seconds) -> list[Alternative]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -101,6 +102,41 @@ def test_the_choice_is_the_best_of_all_combinations_that_fit(budget: float) -> N
         assert not found.fits and found.seconds == min(map(_seconds, every))
         return
     assert found.fits and (found.gain, -found.seconds) == pytest.approx(max(fitting))
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_values_that_another_beats_in_both_are_left_out_without_changing_the_choice(seed: int) -> None:
+    """Gains without order, as measured ones are, and seconds that are products of knobs."""
+    rng = np.random.default_rng(seed)
+    sizes = {
+        "a.steps": (15, 30, 60, 80, 120),
+        "b.size": (64, 128, 256),
+        "c.frames": (16, 48),
+        "d.mode": ("x", "y", "z"),
+    }
+    base = {"a.steps": 60, "b.size": 128, "c.frames": 48, "d.mode": "x"}
+    by_knob = {
+        k: {v: 0.0 if v == base[k] else float(rng.normal(0, 0.2)) for v in values} for k, values in sizes.items()
+    }
+    by_knob["d.mode"]["z"] = -1.0
+    gains = Gains(by_knob, base)
+    extra = {"x": rng.random(), "y": rng.random(), "z": 2.0}
+    rates, calls = rng.random(3), 0
+
+    def seconds(changes: Mapping[str, Any]) -> float:
+        nonlocal calls
+        calls += 1
+        a, b, c, d = ({**base, **changes}[knob] for knob in base)
+        return float(rates[0] * a * b / 256 + rates[1] * c + rates[2] * b * c / 256 + extra[d])
+
+    every = [dict(zip(sizes, values, strict=True)) for values in product(*sizes.values())]
+    priced = [(seconds(one), sum(by_knob[k][v] for k, v in one.items())) for one in every]
+    for budget in np.quantile([took for took, _ in priced], (0.1, 0.3, 0.6, 1.0)):
+        calls = 0
+        found = choose(gains, seconds, float(budget))
+        best = max(((gain, -took) for took, gain in priced if took <= budget))
+        assert found.fits and (found.gain, -found.seconds) == pytest.approx(best)
+        assert calls < len(every) + 12, "mode z, dearer and worse than x, was tried with all others"
 
 
 def test_a_larger_budget_never_buys_less_and_values_in_between_fill_it() -> None:
