@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from itertools import pairwise, product
 from typing import Any
 
+from scipy.optimize import isotonic_regression
+
 BETWEEN = 3  # values tried between two measured ones, where a knob is a number
 MOST_COMBINATIONS = 100_000  # more, and the values in between are left out
 
@@ -43,6 +45,16 @@ class Gains:
                 share = math.log(value / low) / math.log(high / low)
                 return known[low] + share * (known[high] - known[low])
         return None
+
+    def rising(self, knobs: Sequence[str]) -> Gains:
+        """The same, but gains of these knobs never fall with their value: the nearest such ones (least squares)."""
+        return Gains({k: self._risen(k) if k in knobs else values for k, values in self.by_knob.items()}, self.base)
+
+    def _risen(self, knob: str) -> dict[Any, float]:
+        ordered = sorted(self.by_knob[knob].items())
+        risen = isotonic_regression([gain for _, gain in ordered]).x
+        nearest = {value: float(gain) for (value, _), gain in zip(ordered, risen, strict=True)}
+        return {value: gain - nearest[self.base[knob]] for value, gain in nearest.items()}
 
     def values(self, knob: str, between: int) -> list[Any]:
         """Measured values of a knob, and some between neighbours where they are whole numbers."""
@@ -95,13 +107,15 @@ def choose(gains: Gains, seconds: Seconds, budget_s: float, steps: Sequence[str]
         gains: of the knobs that may be changed.
         seconds: predicts a run.
         budget_s: seconds to spend.
-        steps: knobs whose values between measured ones are tried too.
+        steps: knobs that are steps of a training: values between measured ones are tried too, and gains that fall with
+            more of them are taken for chance.
 
     Raises:
         ValueError: the budget is not positive.
     """
     if not budget_s > 0:
         raise ValueError(f"expected a budget above 0 s, got {budget_s}")
+    gains = gains.rising(steps)
     options = {knob: _worthwhile(gains, knob, seconds, BETWEEN if knob in steps else 0) for knob in gains.by_knob}
     if math.prod(map(len, options.values())) > MOST_COMBINATIONS:
         options = {knob: _worthwhile(gains, knob, seconds, 0) for knob in gains.by_knob}

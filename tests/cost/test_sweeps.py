@@ -148,6 +148,25 @@ def test_a_larger_budget_never_buys_less_and_values_in_between_fill_it() -> None
     assert any(one.changes.get("a.steps", 20) not in (10, 20, 80) for one in found)
 
 
+def test_what_falls_with_more_steps_is_chance_and_leaves_no_time_unused() -> None:
+    """As measured: 15 steps of a training scored better than 30 and 60, 120 best."""
+    gains = Gains({"a.steps": {15: -0.04, 30: -0.20, 60: -0.09, 120: 0.0}, "b.size": {1: -1.0, 2: 0.0}},
+                  {"a.steps": 120, "b.size": 2})  # fmt: skip
+    assert gains.rising(["a.steps"]).by_knob["a.steps"] == pytest.approx({15: -0.12, 30: -0.12, 60: -0.09, 120: 0.0})
+    assert gains.rising(["a.steps"]).by_knob["b.size"] == gains.by_knob["b.size"]
+
+    def seconds(changes: Mapping[str, Any]) -> float:
+        now = {**gains.base, **changes}
+        return float(now["a.steps"] + 10 * now["b.size"])
+
+    found = choose(gains, seconds, 110.0, ("a.steps",))
+    assert found.seconds > 0.85 * 110 and 60 < found.changes["a.steps"] < 120
+    assert choose(gains, seconds, 110.0).changes["a.steps"] == 15, "a knob that is no training keeps what was measured"
+    # The base may be among those that were levelled; it gains nothing over itself.
+    levelled = Gains({"a.steps": {60: 0.0, 100: -0.04}}, {"a.steps": 60}).rising(["a.steps"])
+    assert levelled.by_knob["a.steps"] == pytest.approx({60: 0.0, 100: 0.0})
+
+
 def test_gains_between_measured_values_lie_on_a_line_over_the_logarithm_and_none_are_made_up_outside() -> None:
     assert GAINS.at("a.steps", 40) == pytest.approx(0.5)
     assert GAINS.at("a.steps", 5) is None and GAINS.at("a.steps", 160) is None and GAINS.at("c.mode", "z") is None
