@@ -1,13 +1,14 @@
 """Three ways to spend time, picked from what was measured (docs/cost.md, end to end).
 
-What each costs and scores is its row `preset`, which `ahoy run` cites. `draft` is what knobs are changed around.
-`standard` takes maps of 256, an atlas of 512, larger canonical views and every frame in the texture: a mean ST-LPIPS of
-.191 for draft's .203 over four captures, at .14 dB less. More steps than draft's bought nothing in either training, and
-fewer in the avatar's cost little (its row `avatar.steps=30`). How often landmarks are read and how long the fit is
-iterated is draft's too: what whole runs gained by more of it changed its sign with the state of the code (four passes
-gain .11 to .24 dB on each of the four captures, and lose .06 over eight others). `high` has sizes for
-larger pictures than the captures', where they gained nothing when they were last run, with the fits before: .05 dB less
-than standard on one of them for 4.6 times the time.
+What each costs and scores is its row `preset`, which `ahoy run` cites. `draft` is what knobs are changed around; no
+cheaper row is better in both PSNR and ST-LPIPS, though a quarter of its avatar steps or fewer cost little (its row
+`avatar.steps=15`). `standard` takes maps of 256, an atlas of 512, larger canonical views and every frame in the
+texture: a mean ST-LPIPS of .191 for draft's .203 over four captures, at .14 dB less. The maps do that: alone they have
+.190 in nine tenths of its time (row `coarse.map_size=256`). The rest, and what `high` adds (.184, .10 dB less than
+standard, for 4.2 times its time), is for pictures larger than the captures' 256 pixels. More steps than draft's bought
+nothing in either training. How often landmarks are read and how long the fit is iterated is draft's too: what whole
+runs gained by more of it changed its sign with the state of the code (four passes gain .11 to .24 dB on each of the
+four captures, and lose .06 over eight others).
 """
 
 from __future__ import annotations
