@@ -182,13 +182,11 @@ def _missed(surface: Surface, charts: list[Chart]) -> Chart:
     points = surface.at(faces, bary)
     far = np.flatnonzero(_distances(charts, points) > _FAR * REACH)
     keep = np.ones(len(far), dtype=bool)
-    if len(far):
-        first, second = cKDTree(points[far]).query_pairs(_FAR * REACH, output_type="ndarray").T  # first < second
-        second = second[np.argsort(first, kind="stable")]
-        ends = np.searchsorted(np.sort(first), np.arange(len(far) + 1))
-        for point in range(len(far)):  # in order: whoever is still kept sends away those near it
-            if keep[point]:
-                keep[second[ends[point] : ends[point + 1]]] = False
+    tree = cKDTree(points[far])
+    for index in range(len(far)):  # in order: whoever is still kept sends away those after it that are near
+        if keep[index]:
+            near = np.array(tree.query_ball_point(points[far[index]], _FAR * REACH))
+            keep[near[near > index]] = False
     return scattered(surface, faces[far[keep]], bary[far[keep]])
 
 
